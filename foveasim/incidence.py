@@ -29,8 +29,8 @@ ANGLE = Limits(at_least=-80.0, at_most=80.0, hint="chief ray angles are in degre
 #: Largest tangent radius of a cone: that of f/0.5.
 RADIUS = Limits(above=0.0, at_most=1.0)
 #: Default number of rings of rays, for clear circular pupils and for others.
-N_RINGS, N_RINGS_OF_PUPILS = 2, 8
-#: Largest number of rings: 32,512 rays.
+N_RINGS, N_RINGS_OF_PUPILS = 1, 8
+#: Largest number of rings: 16,320 rays.
 MAX_RINGS = 64
 #: Image heights beyond a table by this fraction are rounding errors.
 HEIGHT_ROUNDING = 1e-9
@@ -151,13 +151,14 @@ class Incidence:
     transmission : callable, optional
         Power transmittance ``T(x, y)`` at points of the pupil, in units of its radius; by default a clear circle.
     n_rings : int
-        Number of rings of rays; ring cubature with ``4 n_rings - 2`` rays per ring, at least 6.
+        Number of rings of rays; ring cubature with ``4 n_rings - 1`` rays per ring, at least 7: an odd number, so that no rays
+        are opposite.
 
     Examples
     --------
     >>> cone = Incidence(np.array([[0.0, 0.0], [1000.0, 0.0]]), radius=0.125, exit_pupil_um=8000.0)
     >>> cone.chief_ray.tolist(), cone.tangents.shape
-    ([[0.0, 0.0], [0.125, 0.0]], (2, 12, 2))
+    ([[0.0, 0.0], [0.125, 0.0]], (2, 7, 2))
     """
 
     field_um: Floats
@@ -271,7 +272,7 @@ class Incidence:
             When the pupil transmits none of the rays.
         """
         n_rings = self.n_rings if n_rings is None else n_rings
-        points, weights = disc_cubature(n_rings, max(4 * n_rings - 2, 6) if n_directions is None else n_directions)
+        points, weights = disc_cubature(n_rings, max(4 * n_rings - 1, 7) if n_directions is None else n_directions)
         if self.transmission is None:
             return points, weights
         # A ray from the point x of the pupil propagates towards -x.

@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 import foveasim as fs
 from foveasim.errors import FoveasimWarning, GeometryError, ParameterError
+from foveasim.incidence import N_RINGS
 from foveasim.layout import inset
 from foveasim.optics import ChiefRayTable
 from foveasim.sensor import ApertureStack, Footprints, Microlens, PixelOptics
@@ -65,9 +66,15 @@ def test_equal_layers_are_one_layer():
 # -- openings and photodiodes -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("n_rings", "tolerance"), [(2, 1e-3), (20, 1e-5)])
-@pytest.mark.parametrize("relative_height", [0.1, 0.5, 1.0])
-def test_response_on_axis_has_closed_form(n_rings, tolerance, relative_height):
+# Up to displacements by half of the width, and by all of it, where the product of both coordinates counts.
+@pytest.mark.parametrize(
+    ("relative_height", "n_rings", "tolerance"),
+    [
+        (0.1, N_RINGS, 1e-3), (0.3, N_RINGS, 1e-3), (0.5, N_RINGS, 1e-3), (1.0, 2, 2e-3),
+        (0.1, 20, 1e-5), (0.5, 20, 1e-5), (1.0, 40, 1e-5),
+    ],
+)  # fmt: skip
+def test_response_on_axis_has_closed_form(relative_height, n_rings, tolerance):
     # Paraxial, far from the pupil: a = h / (n w), with a tangent radius rho.
     f_number = 100.0
     rho = 0.5 / f_number
@@ -77,10 +84,10 @@ def test_response_on_axis_has_closed_form(n_rings, tolerance, relative_height):
     stack = ApertureStack(height_um=height_um, refractive_index=1.5)
 
     found = stack.footprints(SQUARE, lens(f_number).incidence([[0.0, 0.0]]).with_rings(n_rings))
-    assert found.response[0] == pytest.approx(expected, abs=tolerance + 2e-5 * (n_rings == 2))
+    assert found.response[0] == pytest.approx(expected, abs=tolerance)
 
 
-@pytest.mark.parametrize(("n_rings", "tolerance"), [(2, 1e-3), (20, 1e-5)])
+@pytest.mark.parametrize(("n_rings", "tolerance"), [(N_RINGS, 1e-3), (20, 1e-5)])
 def test_response_off_axis_has_closed_form(n_rings, tolerance):
     f_number, c = 1000.0, 0.001
     rho = 0.5 / f_number
@@ -105,7 +112,7 @@ def test_response_is_mean_over_exact_cone(f_number, c):
     share = np.prod(np.maximum(1.0 - np.abs(d) / 3.0, 0.0), axis=-1)
     expected = np.average(share, weights=(1.0 + squared) ** -2.0)
 
-    assert STACK.footprints(SQUARE, cones).response[0] == pytest.approx(expected, abs=1.5e-3)
+    assert STACK.footprints(SQUARE, cones).response[0] == pytest.approx(expected, abs=1e-3)
     assert STACK.footprints(SQUARE, cones.with_rings(20)).response[0] == pytest.approx(expected, abs=3e-5)
 
 
@@ -199,7 +206,7 @@ def test_affine_outlines_have_moments_of_mean_overlap(layout, angle_deg):
         # Means of all quadratic maps are equal.
         np.testing.assert_allclose(affine / affine[0], expected / expected[0], rtol=1e-9, atol=1e-9)
         assert found.area_ratio[site] == pytest.approx(affine[0] / layout.area_um2[site], rel=1e-10)
-        assert found.response[site] == pytest.approx(expected[0] / layout.area_um2[site], abs=4e-3)  # 12 rays, kinks
+        assert found.response[site] == pytest.approx(expected[0] / layout.area_um2[site], abs=1e-2)  # few rays, kinks
 
 
 def blurred_map():
@@ -211,7 +218,7 @@ def blurred_map():
 def affine_errors(layout, angle_deg, stack):
     """Return the relative errors of irradiance means over affine outlines, against one clipped outline per ray."""
     power_map = blurred_map()
-    # Sixteen rays; the footprints have twelve others.
+    # Sixteen rays; the footprints have others.
     cones = at_angle(layout, angle_deg)
     radius, angle = np.sqrt([0.25, 0.75]), 2.0 * np.pi * np.arange(8) / 8
     disc = np.concatenate(
@@ -251,7 +258,7 @@ def test_affine_outlines_replace_clipped_concave_sites():
     ]
     error = affine_errors(fs.Layout.from_polygons(shapes), 17.0, STACK)
 
-    # Measured: 0.22 % and 1.0 %, of sites of which the overlap is not similar to the outline.
+    # The overlap of such sites is not similar to their outline: 0.17 % and 1.1 % of an L, 0.11 % and 0.7 % of a frame.
     assert np.sqrt(np.mean(error**2)) <= 5e-3
     assert np.abs(error).max() <= 2.5e-2
 

@@ -20,7 +20,9 @@ from foveasim._core.jit import njit
 N_MOMENTS = 6
 #: Vertices of the polygon in an image of the pupil: its area is that of the disc to 7e-4.
 N_PUPIL = 96
-SIXTH, TWELFTH = 1.0 / 6.0, 1.0 / 12.0
+_ANGLES = 2.0 * np.pi * np.arange(N_PUPIL) / N_PUPIL
+_COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
+SIXTH, TWELFTH, TWO_OVER_PI = 1.0 / 6.0, 1.0 / 12.0, 2.0 / math.pi
 
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
@@ -136,6 +138,47 @@ def overlap_moments(a_xy, a_rings, a_sites, b_xy, b_rings, b_sites, displacement
 
 
 @njit()
+def _add_outline(xy, start, stop, x_0, y_0, sums):
+    """Add the moments of a ring, relative to a point, to six sums."""
+    x_a, y_a = xy[stop - 1, 0] - x_0, xy[stop - 1, 1] - y_0
+    for k in range(start, stop):
+        x_b, y_b = xy[k, 0] - x_0, xy[k, 1] - y_0
+        part = _moments_below(x_a, x_b, y_a, y_b, -1.0)
+        for m in range(N_MOMENTS):
+            sums[m] += part[m]
+        x_a, y_a = x_b, y_b
+
+
+@njit(types.void(*_rings, _points, _out2))
+def outline_moments(xy, ring_offsets, site_offsets, centre, out):
+    """Write the moments of sites, (n, 6), about centres (n, 2)."""
+    for s in range(out.shape[0]):
+        out[s] = 0.0
+        for ring in range(site_offsets[s], site_offsets[s + 1]):
+            _add_outline(xy, ring_offsets[ring], ring_offsets[ring + 1], centre[s, 0], centre[s, 1], out[s])
+
+
+@njit(types.void(*_rings, _points, _points, _points, _points, _ints, _out2))
+def affine_images(xy, ring_offsets, site_offsets, centre, mean, maps, target, site_of, out):
+    """
+    Write the vertices of affine images of outlines, ``M (x - c - m) + m + shift + target``.
+
+    Image k, around ``target[k]``, is that of the site ``site_of[k]`` with the centre c and the mean m. ``maps[k]`` contains the
+    elements xx, xy, yy of M, and the shift.
+    """
+    n = 0
+    for k in range(site_of.size):
+        s = site_of[k]
+        c_x, c_y = centre[s, 0] + mean[s, 0], centre[s, 1] + mean[s, 1]
+        o_x, o_y = target[k, 0] + mean[s, 0] + maps[k, 3], target[k, 1] + mean[s, 1] + maps[k, 4]
+        for v in range(ring_offsets[site_offsets[s]], ring_offsets[site_offsets[s + 1]]):
+            x, y = xy[v, 0] - c_x, xy[v, 1] - c_y
+            out[n, 0] = o_x + (maps[k, 0] * x + maps[k, 1] * y)
+            out[n, 1] = o_y + (maps[k, 1] * x + maps[k, 2] * y)
+            n += 1
+
+
+@njit()
 def _fill_rays(chief_x, chief_y, radius, points, weights, height_um, squared_index, rays):
     """Write displacement and weight of each ray, (n, 3); the weights have the sum 1."""
     total = 0.0
@@ -150,35 +193,67 @@ def _fill_rays(chief_x, chief_y, radius, points, weights, height_um, squared_ind
         rays[2, i] /= total
 
 
-@njit(fastmath={"reassoc", "contract", "nsz"})
-def _mean_absolute(edge_x, edge_y, rays):
-    """Return the weighted mean of |e × d| over rays."""
+@njit()
+def _fill_circles(squared, radius, radii, areas, height_um, squared_index, circles):
+    """Write the displacements per tangent and weights of circles in a cone, (n, 2), from their means of t²."""
     total = 0.0
-    for i in range(rays.shape[1]):
-        total += rays[2, i] * abs(edge_x * rays[1, i] - edge_y * rays[0, i])
-    return total
+    for j in range(radii.size):
+        mean = squared + radius * radius * radii[j] * radii[j]
+        circles[j, 0] = _displacement_per_tangent(mean, height_um, squared_index)
+        circles[j, 1] = areas[j] / ((1.0 + mean) * (1.0 + mean))
+        total += circles[j, 1]
+    for j in range(radii.size):
+        circles[j, 0] *= circles[j, 1] / total
 
 
 @njit()
-def _half_widths(xy, ring_offsets, first_ring, last_ring, rays):
-    """Return half the sum over the edges of a site of the means of |e × d|."""
-    total = 0.0
+def _kink_error(
+    xy, ring_offsets, first_ring, last_ring, x_0, y_0, c_x, c_y, radius, points, circles, exact_radii, exact_circles
+):
+    """
+    Return half the error of the mean of ``Σ_e |e × d|`` over rays of a cone, relative to the exact mean.
+
+    On a circle around c, of the radius r, the mean of |e × t| is ``r |e| g(s)``, s = |e × c| / r |e|, with
+    ``g(s) = (2/π) (s asin s + sqrt(1 - s²))`` for s < 1, and s above. Displacement per tangent and weight are those of the mean
+    of t² over each circle, for the rays as well. The displacement c shortens the edges of the overlap: the error is that of a
+    parallelogram, which is smaller by the overlap for c.
+    """
+    total, n_points = 0.0, points.shape[0] // circles.shape[0]
+    shortened = twice = 0.0
     for ring in range(first_ring, last_ring):
         start, stop = ring_offsets[ring], ring_offsets[ring + 1]
         for k in range(start, stop):
             after = k + 1 if k + 1 < stop else start
-            total += _mean_absolute(xy[after, 0] - xy[k, 0], xy[after, 1] - xy[k, 1], rays)
-    return 0.5 * total
+            e_x, e_y = xy[after, 0] - xy[k, 0], xy[after, 1] - xy[k, 1]
+            along, widest = abs(e_x * c_y - e_y * c_x), radius * math.hypot(e_x, e_y)
+            shortened += along
+            twice += (xy[k, 0] - x_0) * e_y - (xy[k, 1] - y_0) * e_x
+            for j in range(exact_radii.size):
+                reach = widest * exact_radii[j]
+                if along >= reach:
+                    total -= exact_circles[j, 0] * along
+                else:
+                    s = along / reach
+                    total -= exact_circles[j, 0] * reach * TWO_OVER_PI * (s * math.asin(s) + math.sqrt(1.0 - s * s))
+            for j in range(circles.shape[0]):
+                part = 0.0
+                for i in range(j * n_points, (j + 1) * n_points):
+                    part += abs(e_x * (c_y + radius * points[i, 1]) - e_y * (c_x + radius * points[i, 0]))
+                total += circles[j, 0] * part / n_points
+    per_tangent = 0.0
+    for j in range(circles.shape[0]):
+        per_tangent += circles[j, 0]
+    return 0.5 * total * max(1.0 - per_tangent * shortened / twice, 0.0)
 
 
 @njit(
     types.void(
-        _points, _number, _floats, _floats, _points, _floats, _points, _floats, *_rings, *_rings, _ints, types.boolean,
-        _points, _out2,
+        _points, _number, _floats, _floats, _points, _floats, types.int64, _floats, _floats, *_rings, *_rings, _ints,
+        types.boolean, _points, _out2,
     )
 )  # fmt: skip
 def cone_moments(
-    chief_rays, radius, height_um, squared_index, points, weights, fine_points, fine_weights,
+    chief_rays, radius, height_um, squared_index, points, weights, n_circles, exact_radii, exact_areas,
     a_xy, a_rings, a_sites, b_xy, b_rings, b_sites, site_of, is_same, centre, out,
 ):  # fmt: skip
     """
@@ -186,11 +261,20 @@ def cone_moments(
 
     Row k, (7,), is for the chief ray ``chief_rays[k]`` and the outlines of the site ``site_of[k]``: the mean area, then the
     moments of the sum over the rays about the centre of the site. If A and B are the same, the overlap for small displacements
-    is ``|A| - Σ_e |e × d| / 2``, with a kink at d = 0: its mean over many fine rays replaces that over the rays.
+    is ``|A| - Σ_e |e × d| / 2``, with a kink at d = 0: its mean over the disc of a clear pupil replaces that over the rays.
+    ``n_circles``: number of circles of the rays in a clear pupil, 0 for other pupils. ``exact_radii`` and ``exact_areas``:
+    radii and relative areas of circles in the unit disc for this mean.
     """
     edges_a = np.empty((_largest_size(a_rings, a_sites, site_of), 5))
     edges_b = np.empty((_largest_size(b_rings, b_sites, site_of), 5))
-    rays, fine_rays = np.empty((3, points.shape[0])), np.empty((3, fine_points.shape[0]))
+    rays = np.empty((3, points.shape[0]))
+    # The circles on which the points are, one after another with equal numbers of points.
+    n_points = points.shape[0] // max(n_circles, 1)
+    radii, areas = np.empty(n_circles), np.empty(n_circles)
+    for j in range(n_circles):
+        radii[j] = math.hypot(points[j * n_points, 0], points[j * n_points, 1])
+        areas[j] = weights[j * n_points]
+    circles, exact_circles = np.empty((n_circles, 2)), np.empty((exact_radii.size, 2))
     sums = np.empty(N_MOMENTS)
     last_site = -1
     n_a = n_b = 0
@@ -200,8 +284,8 @@ def cone_moments(
             n_a = _fill_edges(a_xy, a_rings, a_sites[s], a_sites[s + 1], centre[s, 0], centre[s, 1], edges_a)
             n_b = _fill_edges(b_xy, b_rings, b_sites[s], b_sites[s + 1], centre[s, 0], centre[s, 1], edges_b)
             last_site = s
-        chief_x, chief_y = chief_rays[k, 0], chief_rays[k, 1]
-        _fill_rays(chief_x, chief_y, radius, points, weights, height_um, squared_index, rays)
+        c_x, c_y = chief_rays[k, 0], chief_rays[k, 1]
+        _fill_rays(c_x, c_y, radius, points, weights, height_um, squared_index, rays)
         out[k] = 0.0
         smallest = np.inf
         for i in range(points.shape[0]):
@@ -212,11 +296,14 @@ def cone_moments(
             for m in range(N_MOMENTS):
                 out[k, 1 + m] += rays[2, i] * sums[m]
         out[k, 0] = out[k, 1]
-        if is_same and smallest > 0.0:
-            _fill_rays(chief_x, chief_y, radius, fine_points, fine_weights, height_um, squared_index, fine_rays)
-            out[k, 0] += _half_widths(a_xy, a_rings, a_sites[s], a_sites[s + 1], rays) - _half_widths(
-                a_xy, a_rings, a_sites[s], a_sites[s + 1], fine_rays
-            )
+        if is_same and n_circles and smallest > 0.0:
+            squared = c_x * c_x + c_y * c_y
+            _fill_circles(squared, radius, radii, areas, height_um, squared_index, circles)
+            _fill_circles(squared, radius, exact_radii, exact_areas, height_um, squared_index, exact_circles)
+            out[k, 0] += _kink_error(
+                a_xy, a_rings, a_sites[s], a_sites[s + 1], centre[s, 0], centre[s, 1], c_x, c_y, radius, points, circles,
+                exact_radii, exact_circles,
+            )  # fmt: skip
 
 
 # -- images of the pupil ----------------------------------------------------------------------------------------------
@@ -288,8 +375,7 @@ def pupil_fractions(chief_rays, radius, height_um, squared_index, shift, xy, rin
         m_x, m_y = centre[k, 0] + o_x - shift[k, 0], centre[k, 1] + o_y - shift[k, 1]
         extent2 = 0.0
         for i in range(N_PUPIL):
-            angle = 2.0 * math.pi * i / N_PUPIL
-            t_x, t_y = c_x + radius * math.cos(angle), c_y + radius * math.sin(angle)
+            t_x, t_y = c_x + radius * _COSINES[i], c_y + radius * _SINES[i]
             per_tangent = _displacement_per_tangent(t_x * t_x + t_y * t_y, height_um, squared_index)
             image[i, 0], image[i, 1] = per_tangent * t_x - o_x, per_tangent * t_y - o_y
             extent2 = max(extent2, image[i, 0] ** 2 + image[i, 1] ** 2)
@@ -300,7 +386,7 @@ def pupil_fractions(chief_rays, radius, height_um, squared_index, shift, xy, rin
         n = _fill_edges(xy, rings, first_ring, last_ring, m_x, m_y, edges)
         inside[:], total[:] = 0.0, 0.0
         _add_overlap(edges_p, n_p, edges, n, 0.0, 0.0, inside)
-        _add_overlap(edges_p, n_p, edges_p, n_p, 0.0, 0.0, total)
+        _add_outline(image, 0, N_PUPIL, 0.0, 0.0, total)
         low, high = max(math.sqrt(squared) - radius, 0.0), math.sqrt(squared) + radius
         centre2, half2 = 0.5 * (low * low + high * high), 0.5 * (high * high - low * low)
         # Nodes of Chebyshev.

@@ -169,9 +169,15 @@ def _are_congruent(outlines: Outlines, centre_um: Floats) -> bool:
         n_vertices.reshape(n_sites, -1) != n_vertices[:n_rings]
     ).any():
         return False
-    local_um = outlines.xy_um.reshape(n_sites, -1, 2) - centre_um[:, np.newaxis]
-    width_um = np.ptp(local_um[0], axis=0).max()
-    return bool((np.abs(local_um - local_um[0]) <= CONGRUENT * width_um + 1e-12 * np.abs(centre_um).max()).all())
+    vertices_um, first_um = (
+        outlines.xy_um.reshape(n_sites, -1, 2),
+        outlines.xy_um[: n_vertices[:n_rings].sum()] - centre_um[0],
+    )
+    tolerance_um = CONGRUENT * np.ptp(first_um, axis=0).max() + 1e-12 * np.abs(centre_um).max()
+    return all(  # the last one first: most layouts differ there
+        (np.abs(vertices_um[rows] - centre_um[rows, np.newaxis] - first_um) <= tolerance_um).all()
+        for rows in (slice(-1, None), slice(None))
+    )
 
 
 def inset(name: str, outlines: Outlines, margin_um: float) -> Outlines:

@@ -11,7 +11,7 @@ import numpy as np
 from foveasim._core.calls import Limits, OwnCheck, check_declared
 from foveasim._core.rings import site_area_um2
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, Ints
+from foveasim._core.validation import Floats, Ints, freeze
 from foveasim.incidence import Incidence
 from foveasim.sensor.effects.contract import Photosites
 from foveasim.sensor.pixel_optics._affine import affine_maps, determinant
@@ -21,9 +21,9 @@ from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, Outl
 
 __all__ = ["INSET", "ApertureStack"]
 
+#: Number of circles, at least, whose means replace those over rays near the edges.
+N_CIRCLES = 4
 INSET = Limits(at_least=0.0, at_most=1e4, hint="insets are in µm")
-#: Directions and rings of the fine rays of the control variate, at least, and per direction and ring of the rays.
-N_DIRECTIONS, DIRECTIONS_PER_RAY, N_FINE_RINGS = 64, 4, 2
 
 
 @PIXEL_OPTICS.register("aperture_stack", example={"height_um": 2.0, "refractive_index": 1.5})
@@ -121,15 +121,16 @@ class ApertureStack(PixelOptics):
         before = _own_moments(shapes.opening, shapes.centre_um)
         is_same = _is_same(shapes.opening, shapes.photodiode)
         points, weights = incidence.rays()
-        n_directions = max(N_DIRECTIONS, DIRECTIONS_PER_RAY * points.shape[0] // incidence.n_rings)
-        fine_points, fine_weights = incidence.rays(incidence.n_rings + N_FINE_RINGS, n_directions)
+        n_circles = incidence.n_rings if incidence.transmission is None else 0
+        node, weight = np.polynomial.legendre.leggauss(max(N_CIRCLES, 2 * n_circles))
+        radii, areas = 0.5 * (1.0 + node), 0.5 * weight * (1.0 + node)  # in the radius: means of |t| are exact
 
         def values(cones: Incidence, site_of: Ints) -> Floats:
             """Return response, three elements of the matrix and two of the shift of each cone."""
             sums = np.empty((cones.n_sites, 1 + _kernels.N_MOMENTS))
             _kernels.cone_moments(
                 np.ascontiguousarray(cones.chief_ray), cones.radius, layers.height_um, layers.squared_index,
-                points, weights, fine_points, fine_weights, *_arrays(shapes.opening), *_arrays(shapes.photodiode),
+                points, weights, n_circles, radii, areas, *_arrays(shapes.opening), *_arrays(shapes.photodiode),
                 site_of, is_same, shapes.centre_um, sums,
             )  # fmt: skip
             matrix, shift_um, has_map = affine_maps(before[site_of], sums[:, 1:])
@@ -156,11 +157,8 @@ def _own_moments(outlines: Outlines, centre_um: Floats) -> Floats:
     """Return the moments of outlines about centres, (n, 6)."""
     from foveasim.sensor.pixel_optics import _kernels
 
-    vertices = np.repeat(np.arange(outlines.n_sites), np.diff(outlines.ring_offsets[outlines.site_offsets]))
-    local_um = np.ascontiguousarray(outlines.xy_um - centre_um[vertices])
     sums = np.empty((outlines.n_sites, _kernels.N_MOMENTS))
-    rings = local_um, outlines.ring_offsets, outlines.site_offsets
-    _kernels.overlap_moments(*rings, *rings, np.zeros((outlines.n_sites, 2)), sums)
+    _kernels.outline_moments(*_arrays(outlines), centre_um, sums)
     return sums
 
 
@@ -171,18 +169,23 @@ def _centres_um(sites: Photosites, shapes: Shapes) -> Floats:
 
 def _affine_outlines(shapes: Shapes, centre_um: Floats, before: Floats, maps: Floats) -> Outlines:
     """Return the image of each opening: ``M (x - x̄) + x̄ + shift``."""
+    from foveasim.sensor.pixel_optics import _kernels
+
     opening, n_sites = shapes.opening, centre_um.shape[0]
-    n_vertices = np.diff(opening.ring_offsets[opening.site_offsets])
-    rings, site_offsets = opening.ring_offsets, opening.site_offsets
-    local_um = opening.xy_um - np.repeat(shapes.centre_um, n_vertices, axis=0)
+    rings, site_offsets, site_of = opening.ring_offsets, opening.site_offsets, np.arange(n_sites)
     if shapes.is_congruent:
-        n_rings, before = rings.size - 1, np.repeat(before, n_sites, axis=0)
-        local_um = np.tile(local_um, (n_sites, 1))
-        steps = rings[-1] * np.arange(n_sites)[:, np.newaxis]
-        rings = np.append((rings[:-1] + steps).ravel(), rings[-1] * n_sites)
-        site_offsets, n_vertices = n_rings * np.arange(n_sites + 1), np.full(n_sites, n_vertices[0])
+        n_rings, n_vertices = rings.size - 1, rings[-1]
+        rings = np.append((rings[:-1] + n_vertices * site_of[:, np.newaxis]).ravel(), n_vertices * n_sites)
+        site_offsets, site_of = n_rings * np.arange(n_sites + 1), np.zeros(n_sites, np.int64)
+    xy_um = np.empty((rings[-1], 2))
     mean_um = before[:, 1:3] / before[:, :1]
-    a, b, c = (np.repeat(element, n_vertices) for element in maps[:, :3].T)
-    x, y = (local_um - np.repeat(mean_um, n_vertices, axis=0)).T
-    origin_um = np.repeat(centre_um + mean_um + maps[:, 3:5], n_vertices, axis=0)
-    return Outlines(origin_um + np.column_stack((a * x + b * y, b * x + c * y)), rings, site_offsets)
+    _kernels.affine_images(
+        *_arrays(opening),
+        shapes.centre_um,
+        mean_um,
+        np.ascontiguousarray(maps),
+        np.ascontiguousarray(centre_um),
+        site_of,
+        xy_um,
+    )
+    return Outlines(freeze(xy_um), rings, site_offsets)

@@ -16,7 +16,7 @@ import numpy as np
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Floats, Ints, check_per_site, finite_array, read_only
+from foveasim._core.validation import Floats, Ints, check_per_site, finite_array, own, read_only
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.fields import PackedRings
 from foveasim.incidence import Incidence
@@ -60,8 +60,8 @@ class Outlines:
 
     def __post_init__(self) -> None:
         for name, dtype in (("xy_um", np.float64), ("ring_offsets", np.int64), ("site_offsets", np.int64)):
-            array = np.array(getattr(self, name), dtype, order="C")
-            object.__setattr__(self, name, read_only(array.reshape(-1, 2) if name == "xy_um" else array))
+            array = np.ascontiguousarray(getattr(self, name), dtype)
+            object.__setattr__(self, name, own(array.reshape(-1, 2) if name == "xy_um" else array))
 
     @classmethod
     def of(cls, name: str, layout: Any) -> Outlines:
