@@ -195,7 +195,11 @@ def _fill_rays(chief_x, chief_y, radius, points, weights, height_um, squared_ind
 
 @njit()
 def _fill_circles(squared, radius, radii, areas, height_um, squared_index, circles):
-    """Write the displacements per tangent and weights of circles in a cone, (n, 2), from their means of t²."""
+    """
+    Write the displacements per tangent and weights of circles in a cone, (n, 2).
+
+    Both are those of the mean of t² over each circle; the displacement is multiplied by the weight.
+    """
     total = 0.0
     for j in range(radii.size):
         mean = squared + radius * radius * radii[j] * radii[j]
@@ -211,7 +215,7 @@ def _kink_error(
     xy, ring_offsets, first_ring, last_ring, x_0, y_0, c_x, c_y, radius, points, circles, exact_radii, exact_circles
 ):
     """
-    Return half the error of the mean of ``Σ_e |e × d|`` over rays of a cone, relative to the exact mean.
+    Return half the error of the mean of ``Σ_e |e × d|`` over rays of a cone.
 
     On a circle around c, of the radius r, the mean of |e × t| is ``r |e| g(s)``, s = |e × c| / r |e|, with
     ``g(s) = (2/π) (s asin s + sqrt(1 - s²))`` for s < 1, and s above. Displacement per tangent and weight are those of the mean
