@@ -149,6 +149,7 @@ def test_wrong_data_of_views_are_found(result, name, make, problem):
 def test_all_views_show_their_data(visit):
     page = visit(width=1800, height=1000)
     set_value(page, "requirements", [{"measure": "snr", "at_least": 5.0}])
+    set_value(page, "sensor.pixel_optics", {"kind": "aperture_stack", "height_um": 4.0, "refractive_index": 1.5})
     page.evaluate(OPEN_ALL)
     settle(page)
     page.click("#freeze")
