@@ -45,6 +45,11 @@ EXAMPLES = {
     "spectrum_w_m2_sr_nm": [[1.0]],
     "wavelength_nm": [550.0],
     "band_width_nm": 10.0,
+    "field_um": np.zeros((1, 2)),
+    "height_um": 2.0,
+    "refractive_index": 1.5,
+    "image_height_um": (0.0, 100.0),
+    "angle_deg": (0.0, 10.0),
 }
 #: Parameters that others require.
 COMPANIONS = {

@@ -181,7 +181,7 @@ def plot_angular_response(camera: Camera, light: Scene | PowerMap, *, ax: Axes |
     --------
     >>> import foveasim as fs
     >>> stack = fs.sensor.ApertureStack(height_um=4.0, refractive_index=1.5)
-    >>> layout = fs.layout.log_polar(n_sectors=24, r_min_um=20.0, r_max_um=200.0)
+    >>> layout = fs.layout.log_polar(n_sectors=24, r_min_um=20.0, r_max_um=200.0, n_rings=9)
     >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=fs.Sensor(layout, pixel_optics=stack))
     >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
     >>> axes = fs.view.plot_angular_response(camera, scene)
