@@ -431,7 +431,8 @@ def test_charts_compare_pinned_photosites(visit):
     page.keyboard.up("Shift")
     until(page, "() => studio.isReady && studio.page.kept.length === 2")
     names = ["photosite 0", f"photosite {last:,}"]
-    until(page, "() => studio.views.made.photon_transfer.chart.curves.length === 2")
+    until(page, "() => ['photon_transfer', 'snr'].every((name) => studio.views.made[name].chart.curves.length === 2)")
+    until(page, "() => studio.views.made.mtf.chart.curves.length === 3")
     assert labels(page, "snr") == labels(page, "photon_transfer") == names
     assert labels(page, "mtf")[1:] == names
     peaks = page.evaluate("studio.views.made.snr.chart.curves.map((curve) => Math.max(...curve.y))")
