@@ -442,6 +442,7 @@ def test_charts_compare_pinned_photosites(visit):
     assert labels(page, "snr") == names
     page.keyboard.press("Escape")
     until(page, "() => studio.isReady && studio.views.made.photon_transfer.chart.curves.length > 2")
+    until(page, "() => studio.views.made.snr.chart.curves.length > 2 && studio.views.made.mtf.chart.curves.length > 3")
     assert {name: labels(page, name) for name in typical} == typical
 
 
