@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import publish
+from foveasim._core.rings import select_sites
+from foveasim._core.short_repr import short_repr
 from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import (
     Floats,
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Grid",
     "Lattice",
+    "Outlines",
     "PackedRings",
     "Pitch",
     "PointMap",
@@ -70,6 +73,47 @@ class PackedRings(Protocol):
 
         Site s has the rings ``site_offsets[s] : site_offsets[s + 1]``; outer rings are counter-clockwise.
         """
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """
+    Packed rings of sites without the rules of a layout: :class:`PackedRings`.
+
+    Parameters
+    ----------
+    xy_um : (n_vertex, 2) float64, µm
+    ring_offsets : (n_ring + 1,) int64
+    site_offsets : (n_site + 1,) int64
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> pair = fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0)
+    >>> Outlines(pair.xy_um, pair.ring_offsets, pair.site_offsets).n_sites
+    2
+    """
+
+    xy_um: Floats
+    ring_offsets: Ints
+    site_offsets: Ints
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("xy_um", np.float64), ("ring_offsets", np.int64), ("site_offsets", np.int64)):
+            array = np.ascontiguousarray(getattr(self, name), dtype)
+            object.__setattr__(self, name, own(array.reshape(-1, 2) if name == "xy_um" else array))
+
+    @property
+    def n_sites(self) -> int:
+        """Number of sites."""
+        return self.site_offsets.size - 1
+
+    def part(self, selection: slice | Ints) -> Outlines:
+        """Return the outlines of some of the sites."""
+        sites = np.atleast_1d(np.arange(self.n_sites)[selection])
+        return Outlines(*select_sites(self.xy_um, self.ring_offsets, self.site_offsets, sites))
 
 
 class Lattice(Protocol):

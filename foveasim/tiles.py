@@ -158,14 +158,15 @@ def _tiles(
         warn_of_focal_length(camera.optics, camera.distortion, light)
     images = _images(camera, light)
     coverages = []
+    smallest_grid = min((image.grid for image in images), key=lambda grid: grid.cell_area_um2)
     for tile in tiles:
         first, last = tile * tile_sites, min((tile + 1) * tile_sites, layout.n_sites)
         clock = Clock()
         with clock.stage("compile layout"):
             sensor = camera.sensor.part(slice(first, last))
-            part = layout[first:last]
-            footprints = find_footprints(camera, part, sensor.pixel_optics, light, camera.position_um)
-            part = placed(part, footprints, camera.position_um)
+            sites = layout[first:last]
+            footprints = find_footprints(camera, sites, sensor.pixel_optics, light, camera.position_um)
+            part = placed(sites, footprints, camera.position_um)
             bounds_um = outline_bounds_um(part, camera.distortion)
             strips = [_rows_under(image.grid, bounds_um) for image in images]
             integrators = [
@@ -179,8 +180,13 @@ def _tiles(
                 )
                 for image, rows in zip(images, strips, strict=True)
             ]
-        smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
-        coverages.append(Covered.by(smallest))
+        if footprints is None or footprints.outlines is None:
+            smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
+            coverages.append(Covered.by(smallest))
+        else:
+            sites = placed(sites, None, camera.position_um)
+            own_um = outline_bounds_um(sites, camera.distortion)
+            coverages.append(Covered.of(sites, own_um, smallest_grid, camera.distortion, camera.n_threads))
         maps = _maps(sensor, light, images, strips, clock)
         rate_e_per_s = integrate_maps(sensor, light, maps, integrators, clock, footprints)
         # Arrays per site are those of all sites, as in a stored capture.
@@ -188,9 +194,8 @@ def _tiles(
         part_streams = Streams(streams.seed, streams.frame, first // BLOCK_SITES)
         yield expose(camera, sensor, light, rate_e_per_s, exposure_s, part_streams, clock, tile=about)
     if coverages:
-        smallest_image = min((image.grid for image in images), key=lambda grid: grid.cell_area_um2)
         gaze_um = camera.gaze_um if any(camera.gaze_um) else None
-        warn_of_coverage(source, Covered.union(smallest_image.bounds_um, coverages), layout.n_sites, gaze_um)
+        warn_of_coverage(source, Covered.union(smallest_grid.bounds_um, coverages), layout.n_sites, gaze_um)
 
 
 def _images(camera: Camera, light: Scene | PowerMap) -> list[_Image]:

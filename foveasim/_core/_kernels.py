@@ -26,6 +26,9 @@ _LOW, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
 _12, _ONE_IN_2_52 = np.uint64(12), 2.0**-52
 #: Number of random numbers that are computed at a time: their buffers fit in the L1 cache.
 BATCH = 1024
+#: Moments of an area: 1, x, y, x², xy, y².
+N_MOMENTS = 6
+_SIXTH, _TWELFTH = 1.0 / 6.0, 1.0 / 12.0
 _QUARTER, _HALF = BATCH // 4, BATCH // 2
 _points = types.Array(types.float64, 2, "C", readonly=True)
 _ints = types.Array(types.int64, 1, "C", readonly=True)
@@ -202,6 +205,44 @@ def ring_moments(xy, ring_offsets, area, moment):
         area[ring] = 0.5 * twice
         moment[ring, 0] = moment_x / 6.0 + x0 * area[ring]
         moment[ring, 1] = moment_y / 6.0 + y0 * area[ring]
+
+
+@njit()
+def moments_below(x_a, x_b, y_a, y_b, sign):
+    """Return the moments between a line from (x_a, y_a) to (x_b, y_b) and y = 0."""
+    h = sign * (x_b - x_a)
+    total, square_a, square_b, product = y_a + y_b, y_a * y_a, y_b * y_b, y_a * y_b
+    x_ab, xx_a, xx_b = x_a + x_b, x_a * x_a, x_b * x_b
+    xx = (x_ab * x_ab + 2.0 * xx_a, x_ab * x_ab + 2.0 * xx_b)
+    return (
+        0.5 * h * total,
+        _SIXTH * h * (x_a * (total + y_a) + x_b * (total + y_b)),
+        _SIXTH * h * (square_a + product + square_b),
+        _TWELFTH * h * (y_a * xx[0] + y_b * xx[1]),
+        0.5 * _TWELFTH * h * (square_a * (x_ab + 2.0 * x_a) + 2.0 * product * x_ab + square_b * (x_ab + 2.0 * x_b)),
+        _TWELFTH * h * total * (square_a + square_b),
+    )
+
+
+@njit()
+def add_outline(xy, start, stop, x_0, y_0, sums):
+    """Add the moments of a ring, relative to a point, to six sums."""
+    x_a, y_a = xy[stop - 1, 0] - x_0, xy[stop - 1, 1] - y_0
+    for k in range(start, stop):
+        x_b, y_b = xy[k, 0] - x_0, xy[k, 1] - y_0
+        part = moments_below(x_a, x_b, y_a, y_b, -1.0)
+        for m in range(N_MOMENTS):
+            sums[m] += part[m]
+        x_a, y_a = x_b, y_b
+
+
+@njit(types.void(_points, _ints, _ints, _points, types.float64[:, ::1]))
+def outline_moments(xy, ring_offsets, site_offsets, centre, out):
+    """Write the moments of sites, (n, 6), about centres (n, 2)."""
+    for s in range(out.shape[0]):
+        out[s] = 0.0
+        for ring in range(site_offsets[s], site_offsets[s + 1]):
+            add_outline(xy, ring_offsets[ring], ring_offsets[ring + 1], centre[s, 0], centre[s, 1], out[s])
 
 
 @njit(types.int64[::1](_points, _ints, _ints, _points, _points))

@@ -25,6 +25,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.validation import Bools, Floats, Ints, read_only
@@ -35,6 +36,8 @@ TIE_FRACTION = 1e-6
 
 #: Turning angles (rad) below this may be rounding errors.
 MIN_TURN_RAD = 1e-12
+#: Ratio of the length of a sharp corner to its offset.
+MITRE_LIMIT = 100.0
 #: Moments of this number of vertices are computed by a kernel: the import of numba takes longer than those of fewer.
 KERNEL_VERTICES = 1 << 14
 
@@ -98,6 +101,42 @@ def _pairs(origin: ArrayLike, unit: ArrayLike) -> tuple[Floats, Floats]:
 def positions_in_runs(lengths: Ints) -> Ints:
     """Return the concatenation of ``arange(n)`` for each run length, (sum of lengths,)."""
     return np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+
+
+def select_sites(xy: Floats, ring_offsets: Ints, site_offsets: Ints, sites: Ints) -> tuple[Floats, Ints, Ints]:
+    """Return the packed rings of some sites, in their order."""
+    rings = _ranges(site_offsets[sites], site_offsets[sites + 1])
+    vertices = _ranges(ring_offsets[rings], ring_offsets[rings + 1])
+    of_rings, of_sites = np.diff(ring_offsets)[rings], np.diff(site_offsets)[sites]
+    return xy[vertices], np.concatenate(([0], np.cumsum(of_rings))), np.concatenate(([0], np.cumsum(of_sites)))
+
+
+def _ranges(starts: Ints, stops: Ints) -> Ints:
+    """Return the concatenated indices of half-open ranges."""
+    return np.repeat(starts, stops - starts) + positions_in_runs(stops - starts)
+
+
+def polygons_of(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> NDArray[Any]:
+    """Return sites as shapely polygons, (n_site,) array of objects."""
+    n_vertices = np.diff(ring_offsets)
+    # shapely requires the first vertex again at the end of a ring.
+    ring_of = np.repeat(np.arange(n_vertices.size), n_vertices + 1)
+    closed = xy_um[ring_offsets[:-1][ring_of] + positions_in_runs(n_vertices + 1) % n_vertices[ring_of]]
+    closed[np.abs(closed) < np.finfo(np.float64).tiny] = 0.0  # GEOS misplaces intersections of denormal coordinates
+    rings = shapely.linearrings(closed, indices=ring_of)
+    sites = np.repeat(np.arange(site_offsets.size - 1), np.diff(site_offsets))
+    return np.asarray(shapely.polygons(rings, indices=sites))
+
+
+def shrink_polygons(polygons: NDArray[Any], margin_um: Floats | float) -> tuple[NDArray[Any], Ints]:
+    """
+    Return polygons that are offset inwards, with sharp corners.
+
+    The second result contains the indices of those that vanish or split into parts.
+    """
+    shrunk = shapely.buffer(polygons, -np.asarray(margin_um), join_style="mitre", mitre_limit=MITRE_LIMIT)
+    is_polygon = shapely.get_type_id(shrunk) == shapely.GeometryType.POLYGON
+    return shrunk, np.flatnonzero(shapely.is_empty(shrunk) | ~is_polygon)
 
 
 def _local_edges(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats, Floats, Floats]:
@@ -202,6 +241,20 @@ def site_moments(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> tuple
         area_um2 = np.add.reduceat(area_um2, site_offsets[:-1])
         moment_um3 = np.add.reduceat(moment_um3, site_offsets[:-1], axis=0)
     return area_um2, moment_um3 / area_um2[:, np.newaxis]
+
+
+def site_moments_about(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints, centre_um: Floats) -> Floats:
+    """
+    Return the moments of every site up to the second order, (n_site, 6).
+
+    Area in µm², moments of x and y in µm³, of x², xy and y² in µm⁴, relative to a centre (n_site, 2) of each.
+    """
+    from foveasim._core import _kernels
+
+    moments = np.empty((site_offsets.size - 1, _kernels.N_MOMENTS))
+    rings = np.ascontiguousarray(xy_um), np.ascontiguousarray(ring_offsets), np.ascontiguousarray(site_offsets)
+    _kernels.outline_moments(*rings, np.ascontiguousarray(centre_um), moments)
+    return moments
 
 
 def site_area_um2(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:

@@ -1042,25 +1042,15 @@ class Camera:
             smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
             covered = Covered.by(smallest)
             if footprints is not None and footprints.outlines is not None:
-                covered = self._covered(smallest.grid, position_um)
+                layout = placed(self._layout, None, position_um)
+                bounds_um = (self._layout_bounds_um() + np.tile(position_um, 2)).tolist()
+                covered = Covered.of(layout, bounds_um, smallest.grid, self._distortion, self._n_threads)
         named_um = None if moving_um is None and not any(gaze_um) else gaze_um
         warn_of_coverage(source, covered, self._layout.n_sites, named_um, warned)
         return integrate_maps(self._sensor, light, maps, integrators, clock, footprints)
 
     def _find_footprints(self, light: Scene | PowerMap, position_um: Position) -> Footprints | None:
         return find_footprints(self, self._layout, self._sensor.pixel_optics, light, position_um, self._footprints)
-
-    def _covered(self, grid: Grid, position_um: Position) -> Covered:
-        """Return the coverage of the layout, whose outlines are not those of the integrators."""
-        if self._distortion is None and self._layout.n_sites:
-            x0_um, y0_um, x1_um, y1_um = (self._layout_bounds_um() + np.tile(position_um, 2)).tolist()
-            low_x_um, low_y_um, high_x_um, high_y_um = grid.bounds_um
-            if low_x_um <= x0_um and low_y_um <= y0_um and x1_um <= high_x_um and y1_um <= high_y_um:
-                return Covered(grid.bounds_um, (x0_um, y0_um, x1_um, y1_um), 0, 0)
-        layout = placed(self._layout, None, position_um)
-        return Covered.by(
-            Integrator(layout, grid, distortion=self._distortion, compiled=False, n_threads=self._n_threads)
-        )
 
     def incidence(
         self, light: Scene | PowerMap, *, gaze_um: tuple[float, float] | None = None, axis: GazeAxis | None = None

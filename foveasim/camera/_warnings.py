@@ -13,7 +13,7 @@ from foveasim._core.validation import Bools, Floats
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import CoverageWarning, ExposureWarning, FoveasimWarning, ParameterError, SamplingWarning
-from foveasim.fields import PowerMap
+from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.optics import Optics
@@ -50,6 +50,22 @@ class Covered(NamedTuple):
         """Return the coverage of an integrator's sites by its grid."""
         n_outside = integrator.sites_outside_image_circle.size
         return cls(integrator.grid.bounds_um, integrator.bounds_um, integrator.n_uncovered, n_outside)
+
+    @classmethod
+    def of(
+        cls, layout: Layout, bounds_um: Sequence[float], grid: Grid, distortion: Lens | None, n_threads: int
+    ) -> Covered:
+        """
+        Return the coverage of a layout by a grid.
+
+        ``bounds_um``: of its undistorted outlines. Without distortion, sites are examined only if these exceed the grid.
+        """
+        x0_um, y0_um, x1_um, y1_um = bounds_um
+        low_x_um, low_y_um, high_x_um, high_y_um = grid.bounds_um
+        is_inside = low_x_um <= x0_um and low_y_um <= y0_um and x1_um <= high_x_um and y1_um <= high_y_um
+        if distortion is None and is_inside:
+            return cls(grid.bounds_um, (x0_um, y0_um, x1_um, y1_um), 0, 0)
+        return cls.by(Integrator(layout, grid, distortion=distortion, compiled=False, n_threads=n_threads))
 
     @classmethod
     def union(cls, image_um: tuple[float, float, float, float], parts: Sequence[Covered]) -> Covered:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import POSITIVE, Limits
-from foveasim._core.rings import next_vertex
+from foveasim._core.rings import site_moments_about
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
@@ -440,7 +440,7 @@ class _Apertures:
     """Sites as sums of Gaussians, with the covariances of their means."""
 
     def __init__(self, layout: Layout, covariance: SceneCovariance) -> None:
-        xx, yy, xy = _second_moments_um2(layout).T
+        xx, xy, yy = _second_moments_um2(layout).T
         # Principal axes of the second moments.
         mean, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
         angle_rad = 0.5 * np.arctan2(2.0 * xy, xx - yy)
@@ -487,16 +487,6 @@ def _spread_of_norm(node: Floats, norm: Floats) -> Floats:
 
 
 def _second_moments_um2(layout: Layout) -> Floats:
-    """Return the second moments xx, yy, xy of the sites over their area, (n_site, 3) µm²."""
-    site = np.repeat(np.arange(layout.n_sites), np.diff(layout.ring_offsets[layout.site_offsets]))
-    x, y = (layout.xy_um - layout.centroid_um[site]).T
-    after = next_vertex(layout.ring_offsets)
-    x1, y1 = x[after], y[after]
-    cross = x * y1 - x1 * y
-    integrals = (
-        (x * x + x * x1 + x1 * x1) * cross / 12.0,
-        (y * y + y * y1 + y1 * y1) * cross / 12.0,
-        (x * y1 + 2.0 * x * y + 2.0 * x1 * y1 + x1 * y) * cross / 24.0,
-    )
-    sums = np.stack([np.bincount(site, part, minlength=layout.n_sites) for part in integrals], axis=1)
-    return np.asarray(sums / layout.area_um2[:, np.newaxis])
+    """Return the second moments xx, xy, yy of the sites over their area, (n_site, 3) µm²."""
+    rings = layout.xy_um, layout.ring_offsets, layout.site_offsets
+    return site_moments_about(*rings, layout.centroid_um)[:, 3:] / layout.area_um2[:, np.newaxis]

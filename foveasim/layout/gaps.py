@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import shapely
 
 from foveasim._core.rings import next_vertex, positions_in_runs, site_area_um2, site_bounds_um
 from foveasim._core.validation import Bools, Floats, Ints, freeze
-from foveasim.fields import PackedRings
+from foveasim.fields import Outlines, PackedRings
 from foveasim.layout.adjacency import TOUCHING_UM, near_boxes
 from foveasim.layout.lattice import RectangleLattice
 from foveasim.layout.model import Layout
@@ -23,15 +21,6 @@ MAX_GAP_FRACTION = 0.5
 MITRE_LIMIT = 10.0
 #: Sine of the angle between edges that count as one straight line.
 STRAIGHT = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class Outlines:
-    """Packed rings, which need not satisfy the rules of a layout."""
-
-    xy_um: Floats
-    ring_offsets: Ints
-    site_offsets: Ints
 
 
 def edge_gaps_um(layout: PackedRings, sites: Ints | None = None) -> Floats:

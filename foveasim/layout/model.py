@@ -19,9 +19,11 @@ from foveasim._core.rings import (
     are_convex,
     from_frame,
     next_vertex,
+    polygons_of,
     positions_in_runs,
     ring_area_um2,
     ring_unsigned_area_um2,
+    select_sites,
     site_bounds_um,
     site_moments,
 )
@@ -446,15 +448,7 @@ class Layout:
 
     def polygons(self) -> NDArray[Any]:
         """Return the sites as shapely polygons, (n_site,) array of objects."""
-        n_vertices = np.diff(self.ring_offsets)
-        # shapely requires the first vertex again at the end of a ring.
-        ring_of = np.repeat(np.arange(n_vertices.size), n_vertices + 1)
-        closed = self.xy_um[self.ring_offsets[:-1][ring_of] + positions_in_runs(n_vertices + 1) % n_vertices[ring_of]]
-        closed[np.abs(closed) < np.finfo(np.float64).tiny] = 0.0  # GEOS misplaces intersections of denormal coordinates
-        rings = shapely.linearrings(closed, indices=ring_of)
-        return np.asarray(
-            shapely.polygons(rings, indices=np.repeat(np.arange(self.n_sites), np.diff(self.site_offsets)))
-        )
+        return polygons_of(*self.rings_um)
 
     # -- transformations: each returns a new layout ----------------------------------------------------------------
 
@@ -466,13 +460,9 @@ class Layout:
         ids = np.atleast_1d(np.arange(self.n_sites)[chosen])
         if ids.ndim != 1:
             raise ParameterError("selection", f"must be a mask, a slice or a list of sites, got {ids.ndim} dimensions")
-        rings = _ranges(self.site_offsets[ids], self.site_offsets[ids + 1])
-        vertices = _ranges(self.ring_offsets[rings], self.ring_offsets[rings + 1])
-        ring_offsets = np.concatenate(([0], np.cumsum(np.diff(self.ring_offsets)[rings])))
-        site_offsets = np.concatenate(([0], np.cumsum(np.diff(self.site_offsets)[ids])))
         columns = {name: column[ids] for name, column in self.columns.items()}
         step = f"selected {ids.size} of {self.n_sites} sites"
-        return derived(self, step, (self.xy_um[vertices], ring_offsets, site_offsets), columns)
+        return derived(self, step, select_sites(*self.rings_um, ids), columns)
 
     def _range(self, first: int, last: int) -> Layout:
         """Return the sites ``first`` to ``last - 1``."""
@@ -813,8 +803,3 @@ def _reverse_rings(xy_um: Floats, ring_offsets: Ints, is_reversed: Bools) -> Flo
     position = positions_in_runs(n_vertices)
     index = np.where(is_reversed[ring_of], -position % n_vertices[ring_of], position)
     return xy_um[ring_offsets[:-1][ring_of] + index]
-
-
-def _ranges(starts: Ints, stops: Ints) -> Ints:
-    """Return the concatenated indices of half-open ranges."""
-    return np.repeat(starts, stops - starts) + positions_in_runs(stops - starts)

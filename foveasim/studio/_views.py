@@ -76,7 +76,7 @@ class Views:
         self._layout = ref(layout)
         for name in self._names:
             if (start := PARTS[name].work_ahead) is not None:
-                start(shot, self._pixels)
+                start(shot)
 
     def forget(self, name: str | None = None) -> None:
         """Send a view again, or all."""

@@ -275,9 +275,8 @@ def outer_edges(position, ring_offsets):
             edges[begin : end[low]].sort()
         for k in range(begin, end[low]):
             high, n_equal = edges[k] >> 1, 0
-            for other in range(
-                max(begin, k - 1) if is_sorted else begin, min(k + 2, end[low]) if is_sorted else end[low]
-            ):
+            first, last = (max(begin, k - 1), min(k + 2, end[low])) if is_sorted else (begin, end[low])
+            for other in range(first, last):
                 n_equal += edges[other] >> 1 == high
             if n_equal == 1:
                 outer[n_outer, 0] = high if edges[k] & 1 else low

@@ -382,6 +382,41 @@ def test_model_agrees_with_capture(name):
     np.testing.assert_array_equal(again.code, capture.code)
 
 
+PIXEL_OPTICS = {
+    "stack": fs.sensor.ApertureStack(height_um=2.0, refractive_index=1.5),
+    "microlens": fs.sensor.Microlens(height_um=16.0, refractive_index=1.5, photodiode_inset_um=0.2, crosstalk=True),
+}
+
+
+def with_pixel_optics(name, kind):
+    plain = camera(name)
+    changed = replace(plain.sensor, pixel_optics=PIXEL_OPTICS[kind])
+    return plain.replace(optics=replace(plain.optics, exit_pupil_mm=0.05), sensor=changed)
+
+
+@pytest.mark.filterwarnings("ignore:the narrowest opening")
+@pytest.mark.parametrize("kind", PIXEL_OPTICS)
+@pytest.mark.parametrize("name", ["plain", "distorted", "gaze"])
+def test_model_collects_light_through_pixel_optics(name, kind):
+    light, original = scene(pitch_um=40.0, n_basis=3), with_pixel_optics(name, kind)
+    model = learn.Model(original, light, ("filters", "exposure_s"), exposure_s=0.01)
+    capture = original.capture(light, exposure_s=0.01, seed=0)
+    found = model()
+    found.sum().backward()
+
+    np.testing.assert_allclose(found.detach().numpy(), capture.expected_e, rtol=1e-10)
+    assert not np.allclose(
+        capture.expected_e, camera(name).capture(light, exposure_s=0.01, seed=0).expected_e, rtol=0.01
+    )
+    assert all(parameter.grad.abs().max() > 0.0 for parameter in model.parameters() if parameter.requires_grad)
+
+
+@pytest.mark.filterwarnings("ignore:the narrowest opening")
+def test_vertices_of_pixel_optics_are_rejected():
+    with pytest.raises(fs.FoveasimError, match="'wrt' must not contain 'vertices' for a sensor with pixel optics"):
+        learn.Model(with_pixel_optics("plain", "stack"), scene(), ("vertices",), exposure_s=0.01)
+
+
 @pytest.mark.parametrize("name", CAMERAS)
 def test_model_derivatives_agree_with_differences(name):
     """Central differences of captures by the simulator itself, with changed objects."""

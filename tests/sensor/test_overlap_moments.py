@@ -9,7 +9,8 @@ import pytest
 import shapely
 
 import foveasim as fs
-from foveasim.sensor.pixel_optics import Outlines, _kernels
+from foveasim.sensor.pixel_optics import _kernels
+from foveasim.sensor.pixel_optics._shapes import as_outlines
 
 SQUARE = shapely.box(-1.5, -1.5, 1.5, 1.5)
 #: A concave outline with a hole.
@@ -34,7 +35,7 @@ def overlaps(one, other, displacements):
     n = len(displacements)
     rings = []
     for polygon in (one, other):
-        outlines = Outlines.of("polygon", fs.Layout.from_polygons([polygon]))
+        outlines = as_outlines("polygon", fs.Layout.from_polygons([polygon]))
         rings += [outlines.xy_um, outlines.ring_offsets, np.zeros(n + 1, np.int64)]
     # The same site for each displacement.
     found = np.empty((n, 6))

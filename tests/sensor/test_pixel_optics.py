@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -438,12 +439,18 @@ def camera_of(layout, pixel_optics, **options):
     return fs.Camera(optics=lens(exit_pupil_mm=1.0, precision="double"), sensor=sensor, **options)
 
 
+@pytest.mark.parametrize(
+    "distortion",
+    [None, fs.distortion.BrownConrady(focal_um=8000.0, k1=-20.0, centre_um=(5.0, 3.0))],
+    ids=["", "distorted"],
+)
 @pytest.mark.parametrize("name", OPTICS)
-def test_moved_sensor_equals_moved_layout(name):
+def test_moved_sensor_equals_moved_layout(name, distortion):
     optics = OPTICS[name] if name != "microlens" else replace(OPTICS[name], shift="none")
     by_um = (11.0, -7.0)
     moved = replace(optics, photodiode=inset(RINGS.translate(*by_um), 0.1)) if "openings" in name else optics
-    sensor, layout = camera_of(RINGS, optics), camera_of(RINGS.translate(*by_um), moved)
+    sensor = camera_of(RINGS, optics, distortion=distortion)
+    layout = camera_of(RINGS.translate(*by_um), moved, distortion=distortion)
 
     found = sensor.photoelectrons_per_s(PHOTOGRAPH, gaze_um=by_um)
     np.testing.assert_allclose(found, layout.photoelectrons_per_s(PHOTOGRAPH), rtol=1e-9)
@@ -478,6 +485,28 @@ def test_tiles_equal_captures(name, monkeypatch):
     assert len(tiles) > 1
     np.testing.assert_allclose(np.concatenate([tile.expected_e for tile in tiles]), capture.expected_e, rtol=1e-11)
     assert (np.concatenate([tile.code for tile in tiles]) == capture.code).mean() > 0.999
+
+
+def test_tiles_warn_of_layout_beyond_image(monkeypatch, recwarn):
+    # The image ends at the layout, and so do the sites; their footprints are displaced.
+    monkeypatch.setattr("foveasim.tiles.BLOCK_SITES", 256)
+    layout = fs.layout.grid(n_x=20, n_y=20, pitch_um=3.0)
+    camera = fs.Camera(optics=lens(exit_pupil_mm=0.1), sensor=fs.Sensor(layout, pixel_optics=STACK))
+    power_map = fs.PowerMap.from_array(np.ones((60, 60)), pitch_um=1.0, wavelength_nm=550.0)
+    list(fs.tiles.capture_tiles(camera, power_map, exposure_s=0.01, seed=0, tile_sites=256))
+
+    assert not any("outside the image" in str(each.message) for each in recwarn)
+    moved = camera.at((0.5, 0.0), None)
+    with pytest.warns(FoveasimWarning, match="20 of 400 photosites lie partly or completely outside the image"):
+        list(fs.tiles.capture_tiles(moved, power_map, exposure_s=0.01, seed=0, tile_sites=256))
+
+
+def test_used_camera_is_pickled():
+    camera = camera_of(RINGS, STACK)
+    before = camera.photoelectrons_per_s(PHOTOGRAPH)
+    again = pickle.loads(pickle.dumps(camera))
+
+    np.testing.assert_array_equal(again.photoelectrons_per_s(PHOTOGRAPH), before)
 
 
 @pytest.mark.parametrize("optics", [STACK, Microlens(height_um=4.0, refractive_index=1.5)], ids=["stack", "microlens"])

@@ -15,7 +15,7 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import LENGTH, Limits
-from foveasim._core.rings import positions_in_runs
+from foveasim._core.rings import positions_in_runs, shrink_polygons
 from foveasim._core.validation import Bools, Ints, check_per_site, check_sites, finite_array, unmasked
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._noding import insert_points
@@ -152,8 +152,7 @@ def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
     """
     margins_um = finite_array("margin_um", margin_um, at_least=0.0)
     check_per_site("margin_um", margins_um, layout.n_sites, or_one=True)
-    shrunk = shapely.buffer(layout.polygons(), -margins_um, join_style="mitre", mitre_limit=100.0)
-    bad = np.flatnonzero(shapely.is_empty(shrunk) | (shapely.get_type_id(shrunk) != shapely.GeometryType.POLYGON))
+    shrunk, bad = shrink_polygons(layout.polygons(), margins_um)
     if bad.size:
         raise GeometryError(
             f"site {bad[0]} would vanish or split into parts{f' (and {bad.size - 1} more)' if bad.size > 1 else ''}: it is "

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
+from foveasim.fields import Outlines
 from foveasim.sensor.pixel_optics.aperture_stack import ApertureStack
-from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, Outlines, PixelOptics
+from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, PixelOptics
 from foveasim.sensor.pixel_optics.microlens import Microlens
 
 __all__ = ["PIXEL_OPTICS", "ApertureStack", "Footprints", "Microlens", "Outlines", "PixelOptics"]

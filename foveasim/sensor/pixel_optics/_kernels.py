@@ -14,15 +14,14 @@ import math
 import numpy as np
 from numba import types
 
+from foveasim._core._kernels import N_MOMENTS, add_outline, moments_below
 from foveasim._core.jit import njit
 
-#: Moments of an overlap: area, x, y, x², xy, y².
-N_MOMENTS = 6
 #: Vertices of the polygon in an image of the pupil: its area is that of the disc to 7e-4.
 N_PUPIL = 96
 _ANGLES = 2.0 * np.pi * np.arange(N_PUPIL) / N_PUPIL
 _COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
-SIXTH, TWELFTH, TWO_OVER_PI = 1.0 / 6.0, 1.0 / 12.0, 2.0 / math.pi
+TWO_OVER_PI = 2.0 / math.pi
 
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
@@ -64,23 +63,6 @@ def _largest_size(ring_offsets, site_offsets, site_of):
 
 
 @njit()
-def _moments_below(x_a, x_b, y_a, y_b, sign):
-    """Return the moments between a line from (x_a, y_a) to (x_b, y_b) and y = 0."""
-    h = sign * (x_b - x_a)
-    total, square_a, square_b, product = y_a + y_b, y_a * y_a, y_b * y_b, y_a * y_b
-    x_ab, xx_a, xx_b = x_a + x_b, x_a * x_a, x_b * x_b
-    xx = (x_ab * x_ab + 2.0 * xx_a, x_ab * x_ab + 2.0 * xx_b)
-    return (
-        0.5 * h * total,
-        SIXTH * h * (x_a * (total + y_a) + x_b * (total + y_b)),
-        SIXTH * h * (square_a + product + square_b),
-        TWELFTH * h * (y_a * xx[0] + y_b * xx[1]),
-        0.5 * TWELFTH * h * (square_a * (x_ab + 2.0 * x_a) + 2.0 * product * x_ab + square_b * (x_ab + 2.0 * x_b)),
-        TWELFTH * h * total * (square_a + square_b),
-    )
-
-
-@njit()
 def _add_overlap(edges_a, n_a, edges_b, n_b, d_x, d_y, sums):
     """Add the moments of A ∩ (B - d) to six sums."""
     m_0, m_x, m_y, m_xx, m_xy, m_yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -102,11 +84,11 @@ def _add_overlap(edges_a, n_a, edges_b, n_b, d_x, d_y, sums):
             if before * after < 0.0:  # the edges cross
                 x = low + (high - low) * (before / (before - after))
                 y = e_y + e_slope * (x - e_low)
-                part = _moments_below(low, x, at_low, y, sign)
+                part = moments_below(low, x, at_low, y, sign)
                 m_0, m_x, m_y = m_0 + part[0], m_x + part[1], m_y + part[2]
                 m_xx, m_xy, m_yy = m_xx + part[3], m_xy + part[4], m_yy + part[5]
                 low, at_low = x, y
-            part = _moments_below(low, high, at_low, at_high, sign)
+            part = moments_below(low, high, at_low, at_high, sign)
             m_0, m_x, m_y = m_0 + part[0], m_x + part[1], m_y + part[2]
             m_xx, m_xy, m_yy = m_xx + part[3], m_xy + part[4], m_yy + part[5]
     sums[0] += m_0
@@ -135,27 +117,6 @@ def overlap_moments(a_xy, a_rings, a_sites, b_xy, b_rings, b_sites, displacement
         n_b = _fill_edges(b_xy, b_rings, b_sites[s], b_sites[s + 1], 0.0, 0.0, edges_b)
         out[s] = 0.0
         _add_overlap(edges_a, n_a, edges_b, n_b, displacement[s, 0], displacement[s, 1], out[s])
-
-
-@njit()
-def _add_outline(xy, start, stop, x_0, y_0, sums):
-    """Add the moments of a ring, relative to a point, to six sums."""
-    x_a, y_a = xy[stop - 1, 0] - x_0, xy[stop - 1, 1] - y_0
-    for k in range(start, stop):
-        x_b, y_b = xy[k, 0] - x_0, xy[k, 1] - y_0
-        part = _moments_below(x_a, x_b, y_a, y_b, -1.0)
-        for m in range(N_MOMENTS):
-            sums[m] += part[m]
-        x_a, y_a = x_b, y_b
-
-
-@njit(types.void(*_rings, _points, _out2))
-def outline_moments(xy, ring_offsets, site_offsets, centre, out):
-    """Write the moments of sites, (n, 6), about centres (n, 2)."""
-    for s in range(out.shape[0]):
-        out[s] = 0.0
-        for ring in range(site_offsets[s], site_offsets[s + 1]):
-            _add_outline(xy, ring_offsets[ring], ring_offsets[ring + 1], centre[s, 0], centre[s, 1], out[s])
 
 
 @njit(types.void(*_rings, _points, _points, _points, _points, _ints, _out2))
@@ -390,7 +351,7 @@ def pupil_fractions(chief_rays, radius, height_um, squared_index, shift, xy, rin
         n = _fill_edges(xy, rings, first_ring, last_ring, m_x, m_y, edges)
         inside[:], total[:] = 0.0, 0.0
         _add_overlap(edges_p, n_p, edges, n, 0.0, 0.0, inside)
-        _add_outline(image, 0, N_PUPIL, 0.0, 0.0, total)
+        add_outline(image, 0, N_PUPIL, 0.0, 0.0, total)
         low, high = max(math.sqrt(squared) - radius, 0.0), math.sqrt(squared) + radius
         centre2, half2 = 0.5 * (low * low + high * high), 0.5 * (high * high - low * low)
         # Nodes of Chebyshev.

@@ -7,15 +7,14 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from foveasim._core.rings import ring_area_um2, site_moments
+from foveasim._core.rings import polygons_of, shrink_polygons, site_moments
 from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, Ints
-from foveasim.errors import GeometryError, ParameterError
+from foveasim.errors import GeometryError, ParameterError, type_name
+from foveasim.fields import Outlines, PackedRings
 from foveasim.incidence import Incidence
 from foveasim.sensor.effects.contract import Photosites
-from foveasim.sensor.pixel_optics.contract import Outlines
 
 #: Sites are congruent if their vertices, relative to their centroids, differ by at most this fraction of their width.
 CONGRUENT = 1e-9
@@ -25,8 +24,6 @@ NODE_STEP = 1.0 / 128.0
 MAX_NODES = 1 << 22
 #: Rows per call of a kernel, fixed so that results do not depend on the number of threads.
 ROWS = 4096
-#: Ratio of the length of a sharp corner to its inset.
-MITRE_LIMIT = 100.0
 
 
 class Shapes(NamedTuple):
@@ -56,7 +53,7 @@ class Shapes(NamedTuple):
         own = _one_of_lattice(sites)
         others = [each for each in (opening, photodiode) if isinstance(each, Outlines)]
         if own is None or others:
-            own = Outlines(sites.xy_um, sites.ring_offsets, sites.site_offsets)
+            own = as_outlines("sites", sites)
             centre_um = site_moments(own.xy_um, own.ring_offsets, own.site_offsets)[1]
             is_congruent = sites.n_sites > 1 and all(_are_congruent(each, centre_um) for each in (own, *others))
             if is_congruent:
@@ -180,6 +177,19 @@ def _are_congruent(outlines: Outlines, centre_um: Floats) -> bool:
     )
 
 
+def as_outlines(name: str, layout: PackedRings | Any) -> Outlines:
+    """
+    Return the outlines of a layout.
+
+    Raises ParameterError with the name of the parameter for other objects.
+    """
+    if isinstance(layout, Outlines):
+        return layout
+    if not all(hasattr(layout, each) for each in ("xy_um", "ring_offsets", "site_offsets")):
+        raise ParameterError(name, f"must be a Layout with the same sites, got {type_name(layout)}")
+    return Outlines(layout.xy_um, layout.ring_offsets, layout.site_offsets)
+
+
 def inset(name: str, outlines: Outlines, margin_um: float) -> Outlines:
     """
     Return outlines that are offset inwards, with sharp corners.
@@ -190,35 +200,15 @@ def inset(name: str, outlines: Outlines, margin_um: float) -> Outlines:
         return outlines
     import shapely
 
-    n_vertices = np.diff(outlines.ring_offsets)
-    ring_of = np.repeat(np.arange(n_vertices.size), n_vertices)
-    rings = shapely.linearrings(outlines.xy_um, indices=ring_of)
-    site_of = np.repeat(np.arange(outlines.n_sites), np.diff(outlines.site_offsets))
-    shrunk = shapely.buffer(
-        shapely.polygons(rings, indices=site_of), -margin_um, join_style="mitre", mitre_limit=MITRE_LIMIT
-    )
-    bad = np.flatnonzero(shapely.is_empty(shrunk) | (shapely.get_type_id(shrunk) != shapely.GeometryType.POLYGON))
+    shrunk, bad = shrink_polygons(polygons_of(outlines.xy_um, outlines.ring_offsets, outlines.site_offsets), margin_um)
     if bad.size:
         raise GeometryError(
             f"the {name} of site {bad[0]} would vanish or split into parts with an inset of {margin_um:g} µm; reduce "
             f"'{name}_inset_um'",
             tuple(int(i) for i in bad),
         )
-    return _packed(shrunk)
-
-
-def _packed(polygons: NDArray[Any]) -> Outlines:
-    """Return the rings of shapely polygons, outlines counter-clockwise and holes clockwise."""
-    import shapely
-
-    rings, site_of = shapely.get_rings(polygons, return_index=True)
-    is_hole = np.concatenate(([False], site_of[1:] == site_of[:-1]))
-    xy_um, ring_of = shapely.get_coordinates(rings, return_index=True)
-    is_last = np.append(ring_of[1:] != ring_of[:-1], True)  # the first vertex, repeated
-    xy_um, ring_of = xy_um[~is_last], ring_of[~is_last]
-    offsets = np.concatenate(([0], np.cumsum(np.bincount(ring_of, minlength=rings.size))))
-    is_reversed = (ring_area_um2(xy_um, offsets) > 0.0) == is_hole
-    index = np.arange(xy_um.shape[0])
-    flipped = offsets[ring_of] + offsets[ring_of + 1] - 1 - index
-    sites = np.concatenate(([0], np.cumsum(np.bincount(site_of, minlength=polygons.size))))
-    return Outlines(xy_um[np.where(is_reversed[ring_of], flipped, index)], offsets, sites)
+    _, xy_um, (ring_offsets, site_offsets) = shapely.to_ragged_array(shapely.orient_polygons(shrunk))
+    # Without the first vertex again at the end of each ring.
+    return Outlines(
+        np.delete(xy_um, ring_offsets[1:] - 1, axis=0), ring_offsets - np.arange(ring_offsets.size), site_offsets
+    )

@@ -9,15 +9,16 @@ from typing import Annotated
 import numpy as np
 
 from foveasim._core.calls import Limits, OwnCheck, check_declared
-from foveasim._core.rings import site_area_um2
+from foveasim._core.rings import site_area_um2, site_moments_about
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, freeze
+from foveasim.fields import Outlines
 from foveasim.incidence import Incidence
 from foveasim.sensor.effects.contract import Photosites
 from foveasim.sensor.pixel_optics._affine import affine_maps, determinant
 from foveasim.sensor.pixel_optics._layers import as_layers
-from foveasim.sensor.pixel_optics._shapes import Shapes
-from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, Outlines, PixelOptics
+from foveasim.sensor.pixel_optics._shapes import Shapes, as_outlines
+from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, PixelOptics
 
 __all__ = ["INSET", "ApertureStack"]
 
@@ -88,7 +89,7 @@ class ApertureStack(PixelOptics):
         as_layers(self)
         for name in ("opening", "photodiode"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, Outlines.of(name, getattr(self, name)))
+                object.__setattr__(self, name, as_outlines(name, getattr(self, name)))
 
     def part(self, selection: slice | Ints) -> ApertureStack:
         """Return the stack of some of the sites."""
@@ -110,6 +111,7 @@ class ApertureStack(PixelOptics):
 
     def footprints(self, sites: Photosites, incidence: Incidence) -> Footprints:
         """Compute the mean overlap of openings and displaced photodiodes, and its affine outlines."""
+        from foveasim._core._kernels import N_MOMENTS
         from foveasim.sensor.pixel_optics import _kernels
 
         if not sites.n_sites:
@@ -118,7 +120,7 @@ class ApertureStack(PixelOptics):
         sites_um2, opening_um2 = (
             site_area_um2(each.xy_um, each.ring_offsets, each.site_offsets) for each in (shapes.sites, shapes.opening)
         )
-        before = _own_moments(shapes.opening, shapes.centre_um)
+        before = site_moments_about(*_arrays(shapes.opening), shapes.centre_um)
         is_same = _is_same(shapes.opening, shapes.photodiode)
         points, weights = incidence.rays()
         n_circles = incidence.n_rings if incidence.transmission is None else 0
@@ -127,7 +129,7 @@ class ApertureStack(PixelOptics):
 
         def values(cones: Incidence, site_of: Ints) -> Floats:
             """Return response, three elements of the matrix and two of the shift of each cone."""
-            sums = np.empty((cones.n_sites, 1 + _kernels.N_MOMENTS))
+            sums = np.empty((cones.n_sites, 1 + N_MOMENTS))
             _kernels.cone_moments(
                 np.ascontiguousarray(cones.chief_ray), cones.radius, layers.height_um, layers.squared_index,
                 points, weights, n_circles, radii, areas, *_arrays(shapes.opening), *_arrays(shapes.photodiode),
@@ -151,15 +153,6 @@ def _arrays(outlines: Outlines) -> tuple[Floats, Ints, Ints]:
 def _is_same(one: Outlines, other: Outlines) -> bool:
     """Return whether two outlines have the same arrays."""
     return one is other or all(np.array_equal(a, b) for a, b in zip(_arrays(one), _arrays(other), strict=True))
-
-
-def _own_moments(outlines: Outlines, centre_um: Floats) -> Floats:
-    """Return the moments of outlines about centres, (n, 6)."""
-    from foveasim.sensor.pixel_optics import _kernels
-
-    sums = np.empty((outlines.n_sites, _kernels.N_MOMENTS))
-    _kernels.outline_moments(*_arrays(outlines), centre_um, sums)
-    return sums
 
 
 def _centres_um(sites: Photosites, shapes: Shapes) -> Floats:

@@ -16,7 +16,7 @@ import numpy as np
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Floats, Ints, check_per_site, finite_array, own, read_only
+from foveasim._core.validation import Floats, Ints, check_per_site, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.fields import PackedRings
 from foveasim.incidence import Incidence
@@ -25,77 +25,10 @@ from foveasim.sensor.effects.contract import Photosites
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-__all__ = ["PIXEL_OPTICS", "Footprints", "Outlines", "PixelOptics"]
+__all__ = ["PIXEL_OPTICS", "Footprints", "PixelOptics"]
 
 #: Fraction of the light by which columns and losses may exceed 1.
 FRACTION_ROUNDING = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Outlines:
-    """
-    Packed rings of photosites, as in :class:`foveasim.Layout`.
-
-    Parameters
-    ----------
-    xy_um : (n_vertex, 2) float64, µm
-        Vertices as ``[x, y]``, ring after ring, without repetition of the first vertex of a ring.
-    ring_offsets : (n_ring + 1,) int64
-        Ring r has the vertices ``ring_offsets[r] : ring_offsets[r + 1]``.
-    site_offsets : (n_site + 1,) int64
-        Site s has the rings ``site_offsets[s] : site_offsets[s + 1]``.
-
-    Examples
-    --------
-    >>> import foveasim as fs
-    >>> Outlines.of("photodiode", fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0)).n_sites
-    2
-    """
-
-    xy_um: Floats
-    ring_offsets: Ints
-    site_offsets: Ints
-
-    __repr__ = short_repr
-
-    def __post_init__(self) -> None:
-        for name, dtype in (("xy_um", np.float64), ("ring_offsets", np.int64), ("site_offsets", np.int64)):
-            array = np.ascontiguousarray(getattr(self, name), dtype)
-            object.__setattr__(self, name, own(array.reshape(-1, 2) if name == "xy_um" else array))
-
-    @classmethod
-    def of(cls, name: str, layout: Any) -> Outlines:
-        """
-        Return the outlines of a layout.
-
-        Raises
-        ------
-        ParameterError
-            When the object is not a layout; the message contains ``name``.
-        """
-        if isinstance(layout, Outlines):
-            return layout
-        if not all(hasattr(layout, each) for each in ("xy_um", "ring_offsets", "site_offsets")):
-            raise ParameterError(name, f"must be a Layout with the same sites, got {type_name(layout)}")
-        return cls(layout.xy_um, layout.ring_offsets, layout.site_offsets)
-
-    @property
-    def n_sites(self) -> int:
-        """Number of sites."""
-        return self.site_offsets.size - 1
-
-    def part(self, selection: slice | Ints) -> Outlines:
-        """Return the outlines of some of the sites."""
-        chosen = np.atleast_1d(np.arange(self.n_sites)[selection])
-        n_rings = np.diff(self.site_offsets)[chosen]
-        rings = np.repeat(self.site_offsets[chosen] - np.cumsum(n_rings) + n_rings, n_rings) + np.arange(n_rings.sum())
-        n_vertices = np.diff(self.ring_offsets)[rings]
-        vertices = np.repeat(self.ring_offsets[rings] - np.cumsum(n_vertices) + n_vertices, n_vertices)
-        return Outlines(
-            self.xy_um[vertices + np.arange(n_vertices.sum())],
-            np.concatenate(([0], np.cumsum(n_vertices))),
-            np.concatenate(([0], np.cumsum(n_rings))),
-        )
 
 
 @dataclass(frozen=True, eq=False)

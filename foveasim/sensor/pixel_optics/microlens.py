@@ -12,12 +12,13 @@ import numpy as np
 from foveasim._core.calls import OwnCheck, check_declared
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, check_choice, check_number
+from foveasim.fields import Outlines
 from foveasim.incidence import ChiefRayTable, Incidence
 from foveasim.sensor.effects.contract import Photosites
 from foveasim.sensor.pixel_optics._layers import Layers, as_layers
-from foveasim.sensor.pixel_optics._shapes import Shapes, inset
+from foveasim.sensor.pixel_optics._shapes import Shapes, as_outlines, inset
 from foveasim.sensor.pixel_optics.aperture_stack import INSET
-from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, Outlines, PixelOptics
+from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, PixelOptics
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -106,7 +107,7 @@ class Microlens(PixelOptics):
             check_choice("shift", shift, SHIFTS) if isinstance(shift, str) else check_number("shift", shift),
         )
         if self.photodiode is not None:
-            object.__setattr__(self, "photodiode", Outlines.of("photodiode", self.photodiode))
+            object.__setattr__(self, "photodiode", as_outlines("photodiode", self.photodiode))
 
     @property
     def has_mixing(self) -> bool:
@@ -175,8 +176,7 @@ class Microlens(PixelOptics):
 
         photodiode = self.photodiode
         if photodiode is None:
-            every = Outlines(sites.xy_um, sites.ring_offsets, sites.site_offsets)
-            photodiode = inset("photodiode", every, self.photodiode_inset_um)
+            photodiode = inset("photodiode", as_outlines("sites", sites), self.photodiode_inset_um)
         starts = photodiode.ring_offsets[photodiode.site_offsets[:-1]]
         low_um, high_um = (find.reduceat(photodiode.xy_um, starts, axis=0) for find in (np.minimum, np.maximum))
         tree = shapely.STRtree(shapely.box(*low_um.T, *high_um.T))

@@ -20,7 +20,7 @@ from foveasim.view.site_colours import encode_light
 N_LEVELS = 1 << 14
 
 
-def _start(shot: Shot, _pixels: int) -> None:
+def _start(shot: Shot) -> None:
     sensor, layout = shot.camera.sensor, shot.camera.layout
     if sensor.n_filters > 1 and layout.n_sites < MANY_SITES:
         _fill.start(layout, sensor.filter_of_site.tobytes(), sensor.n_filters)

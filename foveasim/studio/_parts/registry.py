@@ -60,8 +60,8 @@ class Part:
         Whether the part is not computed for previews either.
     is_of_variants : bool
         Whether the part is computed only when there are variants to compare with.
-    work_ahead : function of Shot and int
-        Starts work that depends on the layout, with the longer side of pictures, before the shot is simulated.
+    work_ahead : function of Shot
+        Starts work that depends on the layout before the shot is simulated.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Part:
     is_lazy: bool = False
     is_costly: bool = False
     is_of_variants: bool = False
-    work_ahead: Callable[[Shot, int], None] | None = None
+    work_ahead: Callable[[Shot], None] | None = None
 
     __repr__ = short_repr
 

@@ -14,7 +14,7 @@ from foveasim.studio._parts.registry import PartData, part
 from foveasim.view.web._content import rules_of
 
 
-def _start(shot: Shot, _pixels: int) -> None:
+def _start(shot: Shot) -> None:
     if shot.rules is not None and shot.camera.layout.n_sites < MANY_SITES:
         _check.start(shot.camera.layout, shot.rules)
 

@@ -22,7 +22,7 @@ MAX_EDGES = 20_000
 EDGES_PER_SIDE, MORE_EDGES = 24, 64
 
 
-def _start(shot: Shot, _pixels: int) -> None:
+def _start(shot: Shot) -> None:
     if shot.camera.layout.n_sites >= MANY_SITES:
         _arrays_of.start(shot.camera.layout)
 
