@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.calls import Limits, OwnCheck, check_declared, publish
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, as_numbers, finite_array, own, read_only
+from foveasim._core.validation import Bools, Floats, as_numbers, finite_array, own, read_only
 from foveasim.errors import ParameterError
 
 __all__ = ["ChiefRayTable", "Incidence"]
@@ -101,12 +101,11 @@ class ChiefRayTable:
             When a position is beyond the last height of the table.
         """
         field_um = finite_array("field_um", field_um, ndim=2)
-        height_um = np.hypot(field_um[:, 0], field_um[:, 1])
-        last_um, highest_um = self.image_height_um[-1], float(height_um.max(initial=0.0))
-        if highest_um > last_um * (1.0 + HEIGHT_ROUNDING):
+        height_um, last_um = np.hypot(field_um[:, 0], field_um[:, 1]), self.image_height_um[-1]
+        if not self.covers(field_um).all():
             raise ParameterError(
                 "image_height_um",
-                f"must extend to {highest_um:.6g} µm, the largest distance of a site",
+                f"must extend to {height_um.max():.6g} µm, the largest distance of a site",
                 last_um,
                 "µm",
             )
@@ -114,11 +113,16 @@ class ChiefRayTable:
         per_um = np.divide(tangent, height_um, out=np.zeros(height_um.size), where=height_um > 0.0)
         return np.asarray(field_um * per_um[:, np.newaxis])
 
+    def covers(self, field_um: Floats) -> Bools:
+        """Return whether positions (n, 2), µm, are within the heights of the table."""
+        return np.hypot(field_um[:, 0], field_um[:, 1]) <= self.image_height_um[-1] * (1.0 + HEIGHT_ROUNDING)
+
     @property
-    def _slope_per_um(self) -> float:
-        """Largest increase of the tangent per µm between two heights."""
+    def um_per_tangent(self) -> float:
+        """Smallest image height per change of the tangent, inf if constant."""
         tangent = np.tan(np.radians(self.angle_deg))
-        return float(np.abs(np.diff(tangent) / np.diff(self.image_height_um)).max())
+        per_um = float(np.abs(np.diff(tangent) / np.diff(self.image_height_um)).max())
+        return 1.0 / per_um if per_um > 0.0 else math.inf
 
 
 @lru_cache(maxsize=16)
@@ -227,16 +231,25 @@ class Incidence:
         """
         return self._chief_rays_at(self.field_um) if table is None else table.tangents(self.field_um)
 
+    def covers(self, field_um: Floats, design: ChiefRayTable | None = None) -> Bools:
+        """
+        Return whether positions (n, 2), µm, are within the table of the lens and that of a design.
+
+        With the displacement of the sensor, and without.
+        """
+        found = np.ones(field_um.shape[0], np.bool_)
+        for table in (self.table, design):
+            if table is not None:
+                found &= table.covers(field_um)
+        return found if self.table is None else found & self.table.covers(field_um + np.array(self.displacement_um))
+
     def _chief_rays_at(self, field_um: Floats) -> Floats:
         return np.asarray(field_um / self.exit_pupil_um) if self.table is None else self.table.tangents(field_um)
 
     @property
     def um_per_tangent(self) -> float:
         """Smallest displacement in the image per change of a chief ray tangent, inf if constant."""
-        if self.table is None:
-            return self.exit_pupil_um
-        slope_per_um = self.table._slope_per_um  # noqa: SLF001 -- of this module
-        return 1.0 / slope_per_um if slope_per_um > 0.0 else math.inf
+        return self.exit_pupil_um if self.table is None else self.table.um_per_tangent
 
     @property
     def tangents(self) -> Floats:

@@ -357,6 +357,45 @@ def test_design_table_is_that_of_other_lens():
     np.testing.assert_array_equal(designed.shift_um(other), Microlens(**parameters).shift_um(own))
 
 
+GRID = fs.layout.grid(n_x=9, n_y=7, pitch_um=3.0)
+
+
+@pytest.mark.parametrize(("last_um", "angle_deg"), [(15.1, 19.0), (1e3, 79.0)])
+@pytest.mark.parametrize("optics", [STACK, Microlens(height_um=6.0, refractive_index=1.5, photodiode_inset_um=0.6)])
+def test_grids_use_tables_to_their_end(optics, last_um, angle_deg):
+    # Sites near the last height of the table, where nodes are beyond it, and others.
+    table = ChiefRayTable((0.0, last_um), (0.0, angle_deg))
+    cones = lens(chief_ray=table).incidence(GRID.centroid_um)
+    found = optics.footprints(GRID, cones).response
+    alone = [optics.footprints(GRID[[k]], cones.at(cones.field_um[[k]])).response[0] for k in range(GRID.n_sites)]
+
+    np.testing.assert_allclose(found, alone, atol=5e-4)
+    assert np.ptp(found) > 0.005
+
+
+@pytest.mark.parametrize("table", [ChiefRayTable((0.0, 5.0), (0.0, 20.0)), ChiefRayTable((0.0, 5.0), (0.0, 0.0))])
+@pytest.mark.parametrize("optics", [STACK, Microlens(height_um=6.0, refractive_index=1.5)])
+def test_short_tables_are_rejected_for_grids(optics, table):
+    with pytest.raises(ParameterError, match=r"'image_height_um' must extend to 15 µm, .* got 5.0 µm"):
+        optics.footprints(GRID, lens(chief_ray=table).incidence(GRID.centroid_um))
+    design = Microlens(height_um=6.0, refractive_index=1.5, shift="optimal", design_chief_ray=table)
+    with pytest.raises(ParameterError, match="'image_height_um' must extend to 15 µm"):
+        design.footprints(GRID, lens().incidence(GRID.centroid_um))
+
+
+def test_telecentric_lens_sees_shift_of_design():
+    design = ChiefRayTable((0.0, 100.0), (0.0, 40.0))
+    optics = Microlens(
+        height_um=6.0, refractive_index=1.5, photodiode_inset_um=0.6, shift="optimal", design_chief_ray=design
+    )
+    cones = lens(exit_pupil_mm=math.inf).incidence(GRID.translate(40.0, 0.0).centroid_um)
+    found = optics.footprints(GRID, cones).response
+    alone = [optics.footprints(GRID[[k]], cones.at(cones.field_um[[k]])).response[0] for k in range(GRID.n_sites)]
+
+    np.testing.assert_allclose(found, alone, atol=5e-4)
+    assert np.ptp(found) > 0.01
+
+
 def test_annular_pupils_are_counted_by_rays():
     # An annulus around the photodiode: of its rays, those within the photodiode's circle.
     disc = fs.Layout.from_polygons([shapely.Point(0, 0).buffer(0.9, quad_segs=200)])

@@ -13,12 +13,12 @@ from foveasim._core.threads import parallel_map, thread_count
 from foveasim._core.validation import Floats, Ints
 from foveasim.errors import GeometryError, ParameterError, type_name
 from foveasim.fields import Outlines, PackedRings
-from foveasim.incidence import Incidence
+from foveasim.incidence import ChiefRayTable, Incidence
 from foveasim.sensor.effects.contract import Photosites
 
 #: Sites are congruent if their vertices, relative to their centroids, differ by at most this fraction of their width.
 CONGRUENT = 1e-9
-#: Step of the nodes of congruent sites in the tangent of the chief ray: bilinear interpolation of responses is within 1e-4.
+#: Step of the nodes of congruent sites in the tangent of the chief ray: bilinear interpolation of responses is within 5e-4.
 NODE_STEP = 1.0 / 128.0
 #: Largest number of nodes; there are 10^5 up to tangents of 1.
 MAX_NODES = 1 << 22
@@ -70,37 +70,43 @@ class Shapes(NamedTuple):
         ]
         return cls(own, shapes[0], shapes[1], np.ascontiguousarray(centre_um), is_congruent)
 
-    def evaluate(self, incidence: Incidence, n_values: int, compute: Callable[[Incidence, Ints], Floats]) -> Floats:
+    def evaluate(
+        self,
+        incidence: Incidence,
+        n_values: int,
+        compute: Callable[[Incidence, Ints], Floats],
+        design: ChiefRayTable | None = None,
+    ) -> Floats:
         """
         Return values per site, (n_site, n_values), for cones of light.
 
         ``compute`` returns the values of rows of cones, given the indices of the outlines. Those of congruent sites are
-        interpolated between nodes in the image, which are the same for all selections of sites.
+        interpolated between nodes in the image, which are the same for all selections of sites; except where a node is beyond
+        the table of the lens, or that of ``design``.
         """
         from foveasim.sensor.pixel_optics import _kernels
 
         if not self.is_congruent:
             return _in_blocks(incidence, np.arange(incidence.n_sites), n_values, compute)
-        step_um = NODE_STEP * incidence.um_per_tangent
-        if not math.isfinite(step_um):  # all cones are the same
-            first = incidence.at(incidence.field_um[:1])
-            return np.repeat(compute(first, np.zeros(1, np.int64)), incidence.n_sites, axis=0)
-        field_um = incidence.field_um
+        field_um, none = incidence.field_um, np.zeros(incidence.n_sites, np.int64)
+        step_um = NODE_STEP * min(incidence.um_per_tangent, math.inf if design is None else design.um_per_tangent)
+        if not math.isfinite(step_um) and incidence.covers(field_um, design).all():  # all cones are the same
+            return np.repeat(compute(incidence.at(field_um[:1]), none[:1]), incidence.n_sites, axis=0)
         # Column by column: many times faster than a reduction along axis 0.
         low, high = (
             np.floor(np.array([find(field_um[:, axis]) for axis in (0, 1)]) / step_um) for find in (np.min, np.max)
         )
-        if np.prod(high - low + 2.0) > MAX_NODES:  # of a table with a step in its angles
-            return _in_blocks(incidence, np.zeros(incidence.n_sites, np.int64), n_values, compute)
+        if not math.isfinite(step_um) or np.prod(high - low + 2.0) > MAX_NODES:  # a table with a step in its angles
+            return _in_blocks(incidence, none, n_values, compute)
         n_x, n_y = (high - low).astype(np.int64) + 2
         columns, rows = low[0] + np.arange(n_x), low[1] + np.arange(n_y)
         nodes_um = np.stack(np.meshgrid(columns * step_um, rows * step_um), axis=-1).reshape(-1, 2)
-        values = np.zeros((nodes_um.shape[0], n_values))
+        values = np.full((nodes_um.shape[0], n_values), np.nan)
         used = np.arange(n_x * n_y)
         if used.size > 4 * field_um.shape[0]:
             used = _nodes_near(field_um / step_um - low, n_x)
-        at = _clip_to_table(incidence, nodes_um[used])
-        values[used] = _in_blocks(at, np.zeros(at.n_sites, np.int64), n_values, compute)
+        used = used[incidence.covers(nodes_um[used], design)]
+        values[used] = _in_blocks(incidence.at(nodes_um[used]), np.zeros(used.size, np.int64), n_values, compute)
         found = np.empty((incidence.n_sites, n_values))
         nodes = values.reshape(n_y, n_x, n_values)
 
@@ -108,6 +114,9 @@ class Shapes(NamedTuple):
             _kernels.interpolate(field_um[rows_of], step_um, low[0], low[1], nodes, found[rows_of])
 
         parallel_map(block, _blocks(incidence.n_sites), thread_count())
+        if used.size < values.shape[0]:
+            alone = np.flatnonzero(np.isnan(found).any(axis=1))
+            found[alone] = _in_blocks(incidence.at(field_um[alone]), none[alone], n_values, compute)
         return found
 
 
@@ -116,17 +125,6 @@ def _nodes_near(position: Floats, n_x: int) -> Ints:
     column, row = np.floor(position).astype(np.int64).T
     corner = row * n_x + column
     return np.unique(np.concatenate([corner, corner + 1, corner + n_x, corner + n_x + 1]))
-
-
-def _clip_to_table(incidence: Incidence, nodes_um: Floats) -> Incidence:
-    """Return cones at nodes; those of outermost sites beyond a table at its last height."""
-    if incidence.table is None:
-        return incidence.at(nodes_um)
-    last_um = incidence.table.image_height_um[-1]
-    displacement_um = np.array(incidence.displacement_um)
-    height_um = np.hypot(*(nodes_um + displacement_um).T)
-    scale = np.minimum(1.0, last_um / np.where(height_um > 0.0, height_um, last_um))[:, np.newaxis]
-    return incidence.at((nodes_um + displacement_um) * scale - displacement_um)
 
 
 def _blocks(n_rows: int) -> list[slice]:

@@ -150,7 +150,7 @@ class Microlens(PixelOptics):
             centre_um = shapes.centre_um[site_of]
             return self._fractions(cones, layers, shapes.photodiode, site_of, centre_um)[:, np.newaxis]
 
-        response = shapes.evaluate(incidence, 1, fractions)[:, 0]
+        response = shapes.evaluate(incidence, 1, fractions, self.design_chief_ray)[:, 0]
         return Footprints(response, mixing=self._mixing(sites, incidence, layers, response) if self.crosstalk else None)
 
     def _fractions(
