@@ -233,9 +233,9 @@ class Incidence:
 
     def covers(self, field_um: Floats, design: ChiefRayTable | None = None) -> Bools:
         """
-        Return whether positions (n, 2), µm, are within the table of the lens and that of a design.
+        Return whether positions are within the table of the lens, and that of a design.
 
-        With the displacement of the sensor, and without.
+        ``field_um``: (n, 2) µm; with the displacement of the sensor, and without.
         """
         found = np.ones(field_um.shape[0], np.bool_)
         for table in (self.table, design):
