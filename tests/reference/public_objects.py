@@ -102,7 +102,7 @@ def public_objects(directory):
         sensor.BandMean(curve=CURVE, band_width_nm=10.0), sensor.ConstantCurve(0.5), sensor.Diffusion(spread_um=0.5),
         sensor.InterPixelCapacitance(neighbour_fraction=0.01), sensor.KernelCrosstalk(kernel=np.full((5, 5), 0.04).tolist()),
         sensor.ApertureStack(height_um=2.0, refractive_index=1.5, photodiode=SITES), sensor.Microlens(height_um=2.0, refractive_index=1.5),
-        sensor.Footprints(np.full(SITES.n_sites, 0.5), SITES), sensor.Outlines.of("photodiode", SITES),
+        sensor.Footprints(np.full(SITES.n_sites, 0.5), SITES), sensor.Outlines(SITES.xy_um, SITES.ring_offsets, SITES.site_offsets),
         sensor.Diffusion(spread_um=0.5).compile(SITES), sensor.LIMITS["read_noise_e"], CAMERA.noise_budget(SCENE, exposure_s=0.01),
         sensor.PassBand(from_nm=400.0), sensor.ProductCurve((CURVE, CURVE)), sensor.Ramp(MANY, np.ones((1000, 9)), np.ones((1000, 9))),
         sensor.Rates(MANY, MANY, MANY), sensor.signal_to_noise(SENSOR, np.full(SITES.n_sites, 50.0), np.zeros(SITES.n_sites)),
