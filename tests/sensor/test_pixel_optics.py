@@ -117,6 +117,15 @@ def test_response_is_mean_over_exact_cone(f_number, c):
     assert STACK.footprints(SQUARE, cones.with_rings(20)).response[0] == pytest.approx(expected, abs=3e-5)
 
 
+@pytest.mark.parametrize("changes", [{"photodiode_inset_um": 0.4}, {"opening_inset_um": 0.3}, {"opening_inset_um": 0.6}])
+@pytest.mark.parametrize(("f_number", "angle_deg"), [(1.4, 0.0), (1.4, 12.0), (2.8, 12.0)])
+def test_responses_of_insets_converge(changes, f_number, angle_deg):
+    stack, cones = replace(STACK, **changes), at_angle(RINGS, angle_deg, f_number)
+    expected = stack.footprints(RINGS, cones.with_rings(24)).response
+
+    np.testing.assert_allclose(stack.footprints(RINGS, cones).response, expected, atol=2e-3)
+
+
 def test_small_sites_lose_more_light():
     layout = fs.layout.log_polar(n_sectors=240, r_min_um=120.8, r_max_um=1012.0, n_rings=81)
     radius_um = np.hypot(*layout.centroid_um.T)

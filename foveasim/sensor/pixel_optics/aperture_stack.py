@@ -22,6 +22,8 @@ from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, Pixe
 
 __all__ = ["INSET", "ApertureStack"]
 
+#: Number of rings of rays, at least, where openings and photodiodes differ.
+N_RINGS_OF_INSETS = 3
 #: Number of circles, at least, whose means replace those over rays near the edges.
 N_CIRCLES = 4
 INSET = Limits(at_least=0.0, at_most=1e4, hint="insets are in µm")
@@ -60,7 +62,8 @@ class ApertureStack(PixelOptics):
     overlap: on photographs blurred by 1.5 µm, within 0.05 % (rms) of sixteen clipped outlines per site.
 
     Rays are geometric: diffraction inside the stack is neglected, which is wrong for openings of a few wavelengths. Light that
-    misses its photodiode is absorbed. Sites of equal shape are interpolated between nodes of 1/128 in the tangent of the
+    misses its photodiode is absorbed. Responses are within 1e-3 of the mean over the cone; where openings and photodiodes differ,
+    within 2e-3, from three rings of rays. Sites of equal shape are interpolated between nodes of 1/128 in the tangent of the
     chief ray.
 
     Source: P. B. Catrysse and B. A. Wandell, Optical efficiency of image sensor pixels, J. Opt. Soc. Am. A 19, 1610 (2002).
@@ -122,6 +125,8 @@ class ApertureStack(PixelOptics):
         )
         before = site_moments_about(*_arrays(shapes.opening), shapes.centre_um)
         is_same = _is_same(shapes.opening, shapes.photodiode)
+        if not is_same:
+            incidence = incidence.with_rings(max(incidence.n_rings, N_RINGS_OF_INSETS))
         points, weights = incidence.rays()
         n_circles = incidence.n_rings if incidence.transmission is None else 0
         node, weight = np.polynomial.legendre.leggauss(max(N_CIRCLES, 2 * n_circles))
