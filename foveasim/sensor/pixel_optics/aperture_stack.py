@@ -62,9 +62,9 @@ class ApertureStack(PixelOptics):
     overlap: on photographs blurred by 1.5 µm, within 0.05 % (rms) of sixteen clipped outlines per site.
 
     Rays are geometric: diffraction inside the stack is neglected, which is wrong for openings of a few wavelengths. Light that
-    misses its photodiode is absorbed. Responses are within 1e-3 of the mean over the cone; where openings and photodiodes differ,
-    within 2e-3, from three rings of rays. Sites of equal shape are interpolated between nodes of 1/128 in the tangent of the
-    chief ray.
+    misses its photodiode is absorbed. Responses are within 1e-3 of the mean over the cone; where openings and photodiodes
+    differ, within 2e-3, from three rings of rays. Sites of equal shape are interpolated between nodes of 1/128 in the tangent
+    of the chief ray.
 
     Source: P. B. Catrysse and B. A. Wandell, Optical efficiency of image sensor pixels, J. Opt. Soc. Am. A 19, 1610 (2002).
 
