@@ -117,7 +117,9 @@ def test_response_is_mean_over_exact_cone(f_number, c):
     assert STACK.footprints(SQUARE, cones.with_rings(20)).response[0] == pytest.approx(expected, abs=3e-5)
 
 
-@pytest.mark.parametrize("changes", [{"photodiode_inset_um": 0.4}, {"opening_inset_um": 0.3}, {"opening_inset_um": 0.6}])
+@pytest.mark.parametrize(
+    "changes", [{"photodiode_inset_um": 0.4}, {"opening_inset_um": 0.3}, {"opening_inset_um": 0.6}]
+)
 @pytest.mark.parametrize(("f_number", "angle_deg"), [(1.4, 0.0), (1.4, 12.0), (2.8, 12.0)])
 def test_responses_of_insets_converge(changes, f_number, angle_deg):
     stack, cones = replace(STACK, **changes), at_angle(RINGS, angle_deg, f_number)
