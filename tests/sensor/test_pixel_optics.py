@@ -208,7 +208,7 @@ def second_moments(polygon):
 @pytest.mark.parametrize("layout", [RINGS[::97], CONCAVE], ids=["quadrilaterals", "concave"])
 @pytest.mark.parametrize("angle_deg", [0.0, 17.0])
 def test_affine_outlines_have_moments_of_mean_overlap(layout, angle_deg):
-    cones = at_angle(layout, angle_deg)
+    cones = at_angle(layout, angle_deg).with_rings(6)  # at all displacements
     found = STACK.footprints(layout, cones)
     outlines = fs.Layout(found.outlines.xy_um, found.outlines.ring_offsets, found.outlines.site_offsets).polygons()
     for site in range(layout.n_sites):

@@ -15,17 +15,14 @@ from foveasim._core.validation import Floats, Ints, freeze
 from foveasim.fields import Outlines
 from foveasim.incidence import Incidence
 from foveasim.sensor.effects.contract import Photosites
-from foveasim.sensor.pixel_optics._affine import affine_maps, determinant
 from foveasim.sensor.pixel_optics._layers import as_layers
 from foveasim.sensor.pixel_optics._shapes import Shapes, as_outlines
 from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, PixelOptics
 
 __all__ = ["INSET", "ApertureStack"]
 
-#: Number of rings of rays, at least, where openings and photodiodes differ.
-N_RINGS_OF_INSETS = 3
-#: Number of circles, at least, whose means replace those over rays near the edges.
-N_CIRCLES = 4
+#: Numbers of rings of rays, at least, for increasing displacements; more where openings and photodiodes differ.
+N_RINGS, N_RINGS_OF_INSETS = (1, 2, 3, 6), (3, 4, 5, 8)
 INSET = Limits(at_least=0.0, at_most=1e4, hint="insets are in µm")
 
 
@@ -62,9 +59,9 @@ class ApertureStack(PixelOptics):
     overlap: on photographs blurred by 1.5 µm, within 0.05 % (rms) of sixteen clipped outlines per site.
 
     Rays are geometric: diffraction inside the stack is neglected, which is wrong for openings of a few wavelengths. Light that
-    misses its photodiode is absorbed. Responses are within 1e-3 of the mean over the cone; where openings and photodiodes
-    differ, within 2e-3, from three rings of rays. Sites of equal shape are interpolated between nodes of 1/128 in the tangent
-    of the chief ray.
+    misses its photodiode is absorbed. The number of rays increases with the displacements, in widths of a site: responses are
+    within 1e-3 of the mean over the cone; where openings and photodiodes differ, within 2e-3. Sites of equal shape are
+    interpolated between nodes of 1/128 in the tangent of the chief ray.
 
     Source: P. B. Catrysse and B. A. Wandell, Optical efficiency of image sensor pixels, J. Opt. Soc. Am. A 19, 1610 (2002).
 
@@ -114,39 +111,36 @@ class ApertureStack(PixelOptics):
 
     def footprints(self, sites: Photosites, incidence: Incidence) -> Footprints:
         """Compute the mean overlap of openings and displaced photodiodes, and its affine outlines."""
-        from foveasim._core._kernels import N_MOMENTS
         from foveasim.sensor.pixel_optics import _kernels
 
         if not sites.n_sites:
             return Footprints(np.zeros(0))
         shapes, layers = self._shapes(sites), as_layers(self)
-        sites_um2, opening_um2 = (
-            site_area_um2(each.xy_um, each.ring_offsets, each.site_offsets) for each in (shapes.sites, shapes.opening)
-        )
         before = site_moments_about(*_arrays(shapes.opening), shapes.centre_um)
+        sites_um2 = before[:, 0] if shapes.opening is shapes.sites else site_area_um2(*_arrays(shapes.sites))
         is_same = _is_same(shapes.opening, shapes.photodiode)
-        if not is_same:
-            incidence = incidence.with_rings(max(incidence.n_rings, N_RINGS_OF_INSETS))
-        points, weights = incidence.rays()
-        n_circles = incidence.n_rings if incidence.transmission is None else 0
-        node, weight = np.polynomial.legendre.leggauss(max(N_CIRCLES, 2 * n_circles))
-        radii, areas = 0.5 * (1.0 + node), 0.5 * weight * (1.0 + node)  # in the radius: means of |t| are exact
+        sets = [max(n_rings, incidence.n_rings) for n_rings in (N_RINGS if is_same else N_RINGS_OF_INSETS)]
+        rays = [incidence.rays(n_rings) for n_rings in sets]
+        points = np.ascontiguousarray(np.concatenate([each for each, _ in rays]).T)
+        weights = np.concatenate([each for _, each in rays])
+        offsets = np.cumsum([0, *(each.size for _, each in rays)])
+        has_disc = incidence.transmission is None
 
         def values(cones: Incidence, site_of: Ints) -> Floats:
             """Return response, three elements of the matrix and two of the shift of each cone."""
-            sums = np.empty((cones.n_sites, 1 + N_MOMENTS))
-            _kernels.cone_moments(
+            found = np.empty((cones.n_sites, 6))
+            _kernels.cone_footprints(
                 np.ascontiguousarray(cones.chief_ray), cones.radius, layers.height_um, layers.squared_index,
-                points, weights, n_circles, radii, areas, *_arrays(shapes.opening), *_arrays(shapes.photodiode),
-                site_of, is_same, shapes.centre_um, sums,
+                points, weights, offsets, has_disc, *_arrays(shapes.opening), *_arrays(shapes.photodiode),
+                site_of, is_same, shapes.centre_um, before, found,
             )  # fmt: skip
-            matrix, shift_um, has_map = affine_maps(before[site_of], sums[:, 1:])
-            response = np.where(has_map, sums[:, 0] / sites_um2[site_of], 0.0)
-            return np.column_stack((response, matrix, shift_um))
+            found[:, 0] /= sites_um2[site_of]
+            return found
 
         found = shapes.evaluate(incidence, 6, values)
-        own = np.zeros(sites.n_sites, np.int64) if shapes.is_congruent else np.arange(sites.n_sites)
-        ratio = determinant(found[:, 1:4]) * (opening_um2 / sites_um2)[own]
+        own = np.zeros(sites.n_sites, np.int64) if shapes.is_congruent else slice(None)
+        xx, xy, yy = found[:, 1:4].T
+        ratio = (xx * yy - xy * xy) * (before[:, 0] / sites_um2)[own]
         outlines = _affine_outlines(shapes, _centres_um(sites, shapes), before, found[:, 1:])
         return Footprints(np.clip(found[:, 0], 0.0, 1.0), outlines, ratio)
 

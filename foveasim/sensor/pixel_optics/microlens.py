@@ -166,7 +166,8 @@ class Microlens(PixelOptics):
         if cones.transmission is None:
             _kernels.pupil_fractions(*stack, *target)
         else:
-            _kernels.ray_fractions(*stack, *cones.rays(), *target)
+            points, weights = cones.rays()
+            _kernels.ray_fractions(*stack, np.ascontiguousarray(points.T), weights, *target)
         return found
 
     def _mixing(self, sites: Photosites, incidence: Incidence, layers: Layers, response: Floats) -> csr_array[Any]:
