@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated, Any
 
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.calls import Limits, OwnCheck, check_declared, publish
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Bools, Floats, as_numbers, finite_array, own, read_only
+from foveasim._core.validation import Bools, Floats, Ints, as_numbers, finite_array, own, read_only
 from foveasim.errors import ParameterError
 
 __all__ = ["ChiefRayTable", "Incidence"]
@@ -172,6 +172,15 @@ class Incidence:
     displacement_um: tuple[float, float] = (0.0, 0.0)
     transmission: OwnCheck[Callable[[Floats, Floats], Any] | None] = None
     n_rings: Annotated[int, Limits(at_least=1, at_most=MAX_RINGS)] = N_RINGS
+    #: Positions of rows and columns of sites, x (n_column,) and y (n_row,), instead of ``field_um``.
+    axes_um: tuple[Floats, Floats] | None = field(default=None, init=False)
+
+    def __getattr__(self, name: str) -> Floats:
+        # Only called for attributes that are not set: the positions in rows and columns.
+        if name != "field_um" or self.axes_um is None:
+            raise AttributeError(f"'Incidence' object has no attribute '{name}'")
+        object.__setattr__(self, name, own(self.positions_um(np.arange(self.n_sites))))
+        return self.field_um
 
     def __post_init__(self) -> None:
         check_declared(self)
@@ -190,15 +199,36 @@ class Incidence:
     @property
     def n_sites(self) -> int:
         """Number of sites."""
-        return self.field_um.shape[0]
+        return self.field_um.shape[0] if self.axes_um is None else self.axes_um[0].size * self.axes_um[1].size
 
     def with_rings(self, n_rings: int) -> Incidence:
         """Return the same cones with another number of rings of rays."""
-        return replace(self, n_rings=n_rings)
+        if self.axes_um is None:
+            return replace(self, n_rings=n_rings)
+        return replace(self.at(np.zeros((0, 2))), n_rings=n_rings).on_axes(*self.axes_um)
 
     def at(self, field_um: Floats) -> Incidence:
         """Return the cones of the same lens at other positions, (n, 2) µm."""
         return replace(self, field_um=field_um)
+
+    def on_axes(self, x_um: Floats, y_um: Floats) -> Incidence:
+        """
+        Return the cones of the same lens at positions in rows and columns.
+
+        Site ``row * n_column + column`` is at ``x_um[column]`` and ``y_um[row]``; :attr:`field_um` is created when it is read.
+        """
+        found = self.at(np.zeros((0, 2)))
+        object.__delattr__(found, "field_um")
+        object.__setattr__(found, "axes_um", (read_only(x_um), read_only(y_um)))
+        return found
+
+    def positions_um(self, selection: Ints) -> Floats:
+        """Return the positions of some sites relative to the optical axis, (n, 2) µm."""
+        if self.axes_um is None:
+            return np.asarray(self.field_um[selection])
+        x_um, y_um = self.axes_um
+        row, column = np.divmod(selection, x_um.size)
+        return np.stack((x_um[column], y_um[row]), axis=1)
 
     @property
     def image_height_um(self) -> Floats:

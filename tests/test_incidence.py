@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from scipy.special import gamma
@@ -50,6 +52,18 @@ def test_telecentric_lens_has_normal_chief_rays():
     cone = fs.Optics(focal_length_mm=8.0, f_number=2.0, exit_pupil_mm=np.inf).incidence(FIELD_UM)
 
     np.testing.assert_array_equal(cone.chief_ray, 0.0)
+
+
+def test_rows_and_columns_are_positions():
+    lens = fs.Optics(focal_length_mm=8.0, f_number=2.0)
+    x_um, y_um = np.array([-3.0, 0.0, 4.0]), np.array([1.0, 2.0])
+    cone = pickle.loads(pickle.dumps(lens.incidence(FIELD_UM).on_axes(x_um, y_um))).with_rings(3)
+    expected = np.stack(np.meshgrid(x_um, y_um), axis=-1).reshape(-1, 2)
+
+    assert (cone.n_sites, cone.n_rings) == (6, 3)
+    np.testing.assert_array_equal(cone.positions_um(np.array([4, 2])), expected[[4, 2]])
+    np.testing.assert_array_equal(cone.field_um, expected)
+    np.testing.assert_array_equal(cone.chief_ray, lens.incidence(expected).chief_ray)
 
 
 def test_displacement_moves_field_but_not_design():

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from foveasim._core.validation import Floats, read_only
+from foveasim._core.validation import read_only
 from foveasim.camera._steps import SensorFrame
 from foveasim.camera._warnings import warn_of_small_openings
 from foveasim.fields import PackedRings, PowerMap
@@ -76,19 +76,12 @@ def find_incidence(
     """Return the cones of light at the sites, and the position of the optical axis, µm."""
     frame = camera.sensor_frame(light) if isinstance(light, Scene) else SensorFrame.of(camera.distortion)
     distance_m = light.distance_m if isinstance(light, Scene) else None
-    field_um = read_only(site_centres_um(layout, frame.axis_um))
-    return camera.optics.incidence(field_um, distance_m, displacement_um=position_um), frame.axis_um
-
-
-def site_centres_um(layout: Layout, origin_um: Position) -> Floats:
-    """Return the centroid of each site relative to an origin, (n_site, 2) µm."""
+    none = np.zeros((0, 2))
+    cones = camera.optics.incidence(none, distance_m, displacement_um=position_um)
     if layout.lattice is None:
-        return layout.centroid_um - np.array(origin_um)
-    axes = zip((layout.lattice.x_um, layout.lattice.y_um), origin_um, strict=True)
-    x_um, y_um = (0.5 * axis.sum(axis=1) - origin for axis, origin in axes)
-    centres_um = np.empty((y_um.size, x_um.size, 2))
-    centres_um[..., 0], centres_um[..., 1] = x_um, y_um[:, np.newaxis]
-    return centres_um.reshape(-1, 2)
+        return cones.at(read_only(layout.centroid_um - np.array(frame.axis_um))), frame.axis_um
+    axes = zip((layout.lattice.x_um, layout.lattice.y_um), frame.axis_um, strict=True)
+    return cones.on_axes(*(0.5 * axis.sum(axis=1) - origin for axis, origin in axes)), frame.axis_um
 
 
 def placed(layout: Layout, footprints: Footprints | None, position_um: Position) -> Layout:

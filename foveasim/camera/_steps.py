@@ -97,7 +97,7 @@ def integrate_maps(
         rate_e_per_s *= w_from_w_m2_um2(1.0)
         _check_rates(light, rate_e_per_s, integrators[0].order)
         np.maximum(rate_e_per_s, 0.0, out=rate_e_per_s)
-        return rate_e_per_s if footprints is None else footprints.apply(rate_e_per_s)
+        return rate_e_per_s if footprints is None else footprints.apply(rate_e_per_s, out=rate_e_per_s)
 
 
 def _check_rates(light: Scene | PowerMap, rate_e_per_s: Floats, order: int) -> None:

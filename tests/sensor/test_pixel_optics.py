@@ -117,6 +117,17 @@ def test_response_is_mean_over_exact_cone(f_number, c):
     assert STACK.footprints(SQUARE, cones.with_rings(20)).response[0] == pytest.approx(expected, abs=3e-5)
 
 
+@pytest.mark.parametrize("layout", [SQUARE, RINGS[::97]], ids=["square", "quadrilaterals"])
+@pytest.mark.parametrize("height_um", [0.5, 2.0, 6.0])
+@pytest.mark.parametrize(("f_number", "angle_deg"), [(1.0, 5.0), (1.4, 0.0), (1.4, 18.0), (2.8, 20.0)])
+def test_responses_converge_at_any_displacement(layout, height_um, f_number, angle_deg):
+    # From displacements by 2 % of the width to such by more than all of it.
+    stack, cones = replace(STACK, height_um=height_um), at_angle(layout, angle_deg, f_number)
+    expected = stack.footprints(layout, cones.with_rings(40)).response
+
+    np.testing.assert_allclose(stack.footprints(layout, cones).response, expected, atol=1e-3)
+
+
 @pytest.mark.parametrize(
     "changes", [{"photodiode_inset_um": 0.4}, {"opening_inset_um": 0.3}, {"opening_inset_um": 0.6}]
 )
@@ -382,6 +393,8 @@ def test_grids_use_tables_to_their_end(optics, last_um, angle_deg):
 
     np.testing.assert_allclose(found, alone, atol=5e-4)
     assert np.ptp(found) > 0.005
+    in_rows = cones.on_axes(*(0.5 * axis_um.sum(axis=1) for axis_um in (GRID.lattice.x_um, GRID.lattice.y_um)))
+    np.testing.assert_array_equal(optics.footprints(GRID, in_rows).response, found)
 
 
 @pytest.mark.parametrize("table", [ChiefRayTable((0.0, 5.0), (0.0, 20.0)), ChiefRayTable((0.0, 5.0), (0.0, 0.0))])

@@ -201,6 +201,35 @@ def _add_sides(sides_e, n_e, sides_f, n_f, is_first, rays, n_rays, planes, sums)
                 sums[m, i] += part[m]
 
 
+@njit(types.boolean(*_rings, _number, _out2))
+def inset_convex(xy, ring_offsets, site_offsets, margin, out):
+    """
+    Write outlines that are offset inwards by a margin.
+
+    Return whether all sites are convex and keep all edges; otherwise, the result is incomplete.
+    """
+    sides = np.empty((_largest_size(ring_offsets, site_offsets, np.arange(site_offsets.size - 1)), 5))
+    for s in range(site_offsets.size - 1):
+        n = _fill_sides(xy, ring_offsets, site_offsets[s], site_offsets[s + 1], 0.0, 0.0, sides)
+        if n == 0:
+            return False
+        start, last = ring_offsets[site_offsets[s]], n - 1
+        for k in range(n):
+            # The intersection of both edges, displaced: v + margin (|e| f - |f| e) / (f × e).
+            e_x, e_y, f_x, f_y = sides[k, 2], sides[k, 3], sides[last, 2], sides[last, 3]
+            length_e, length_f = math.hypot(e_x, e_y), math.hypot(f_x, f_y)
+            scale = margin * sides[k, 4]
+            out[start + k, 0] = sides[k, 0] + scale * (length_f * e_x - length_e * f_x)
+            out[start + k, 1] = sides[k, 1] + scale * (length_f * e_y - length_e * f_y)
+            last = k
+        for k in range(n):
+            after = k + 1 if k + 1 < n else 0
+            x, y = out[start + after, 0] - out[start + k, 0], out[start + after, 1] - out[start + k, 1]
+            if not x * sides[k, 2] + y * sides[k, 3] > 0.0:
+                return False
+    return True
+
+
 @njit()
 def _displacement_per_tangent(squared_tangent, height_um, squared_index):
     """Return the displacement in a stack of layers over the tangent of the ray."""
@@ -604,13 +633,20 @@ def pupil_fractions(chief_rays, radius, height_um, squared_index, shift, xy, rin
         per_tangent = _displacement_per_tangent(squared, height_um, squared_index)
         o_x, o_y = per_tangent * c_x, per_tangent * c_y  # displacement of the chief ray
         m_x, m_y = centre[k, 0] + o_x - shift[k, 0], centre[k, 1] + o_y - shift[k, 1]
+        apart2 = _squared_distance(xy, rings, first_ring, last_ring, m_x, m_y)
+        # Displacements change at most by those per tangent times the change of the tangent, the most where it is smallest.
+        low, high = max(math.sqrt(squared) - radius, 0.0), math.sqrt(squared) + radius
+        extent = radius * _displacement_per_tangent(low * low, height_um, squared_index)
+        if apart2 >= extent * extent:
+            out[k] = 1.0 if _is_inside(xy, rings, first_ring, last_ring, m_x, m_y) else 0.0
+            continue
         extent2 = 0.0
         for i in range(N_PUPIL):
             t_x, t_y = c_x + radius * _COSINES[i], c_y + radius * _SINES[i]
             per_tangent = _displacement_per_tangent(t_x * t_x + t_y * t_y, height_um, squared_index)
             image[i, 0], image[i, 1] = per_tangent * t_x - o_x, per_tangent * t_y - o_y
             extent2 = max(extent2, image[i, 0] ** 2 + image[i, 1] ** 2)
-        if _squared_distance(xy, rings, first_ring, last_ring, m_x, m_y) >= extent2:
+        if apart2 >= extent2:
             out[k] = 1.0 if _is_inside(xy, rings, first_ring, last_ring, m_x, m_y) else 0.0
             continue
         n_p = _fill_edges(image, whole, 0, 1, 0.0, 0.0, edges_p)
@@ -618,7 +654,6 @@ def pupil_fractions(chief_rays, radius, height_um, squared_index, shift, xy, rin
         inside[:], total[:] = 0.0, 0.0
         _add_overlap(edges_p, n_p, edges, n, 0, undisplaced, inside)
         add_outline(image, 0, N_PUPIL, 0.0, 0.0, total)
-        low, high = max(math.sqrt(squared) - radius, 0.0), math.sqrt(squared) + radius
         centre2, half2 = 0.5 * (low * low + high * high), 0.5 * (high * high - low * low)
         # Nodes of Chebyshev.
         density_0, p_0 = _density(centre2 - 0.707 * half2, height_um, squared_index)
@@ -653,14 +688,41 @@ def ray_fractions(
         out[k] = min(total, 1.0)
 
 
-@njit(types.void(_points, _number, _number, _number, types.Array(types.float64, 3, "C", readonly=True), _out2))
+_nodes = types.Array(types.float64, 3, "C", readonly=True)
+
+
+@njit()
+def _between(x, n):
+    """Return the interval of n nodes at 0, 1, ... that contains x, and the fraction."""
+    j = min(max(math.floor(x), 0), n - 2)
+    return j, x - j
+
+
+@njit(types.void(_points, _number, _number, _number, _nodes, _out2))
 def interpolate(field, step, first_column, first_row, nodes, out):
     """Interpolate values (n_row, n_column, n_value) at multiples of a step bilinearly."""
     for k in range(out.shape[0]):
-        x, y = field[k, 0] / step - first_column, field[k, 1] / step - first_row
-        j, i = min(max(math.floor(x), 0), nodes.shape[1] - 2), min(max(math.floor(y), 0), nodes.shape[0] - 2)
-        x, y = x - j, y - i
+        j, x = _between(field[k, 0] / step - first_column, nodes.shape[1])
+        i, y = _between(field[k, 1] / step - first_row, nodes.shape[0])
         for v in range(out.shape[1]):
-            low = (1.0 - x) * nodes[i, j, v] + x * nodes[i, j + 1, v]
-            high = (1.0 - x) * nodes[i + 1, j, v] + x * nodes[i + 1, j + 1, v]
-            out[k, v] = (1.0 - y) * low + y * high
+            low = (1.0 - y) * nodes[i, j, v] + y * nodes[i + 1, j, v]
+            high = (1.0 - y) * nodes[i, j + 1, v] + y * nodes[i + 1, j + 1, v]
+            out[k, v] = (1.0 - x) * low + x * high
+
+
+@njit(types.void(_floats, _floats, _number, _number, _number, _nodes, types.Array(types.float64, 3, "C")))
+def interpolate_rows(x, y, step, first_column, first_row, nodes, out):
+    """Interpolate as :func:`interpolate` at x and y, (n_y, n_x, n_value)."""
+    line = np.empty((nodes.shape[1], nodes.shape[2]))
+    columns, fractions = np.empty(x.size, np.int64), np.empty(x.size)
+    for k in range(x.size):
+        columns[k], fractions[k] = _between(x[k] / step - first_column, nodes.shape[1])
+    for row in range(y.size):
+        i, at = _between(y[row] / step - first_row, nodes.shape[0])
+        for j in range(line.shape[0]):
+            for v in range(line.shape[1]):
+                line[j, v] = (1.0 - at) * nodes[i, j, v] + at * nodes[i + 1, j, v]
+        for k in range(x.size):
+            j, fraction = columns[k], fractions[k]
+            for v in range(line.shape[1]):
+                out[row, k, v] = (1.0 - fraction) * line[j, v] + fraction * line[j + 1, v]

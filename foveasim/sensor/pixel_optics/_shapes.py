@@ -24,6 +24,8 @@ NODE_STEP = 1.0 / 128.0
 MAX_NODES = 1 << 22
 #: Rows per call of a kernel, fixed so that results do not depend on the number of threads.
 ROWS = 4096
+#: Sites per call in rows and columns.
+SITES_PER_BLOCK = 1 << 17
 
 
 class Shapes(NamedTuple):
@@ -84,18 +86,15 @@ class Shapes(NamedTuple):
         interpolated between nodes in the image, which are the same for all selections of sites; except where a node is beyond
         the table of the lens, or that of ``design``.
         """
-        from foveasim.sensor.pixel_optics import _kernels
-
         if not self.is_congruent:
             return _in_blocks(incidence, np.arange(incidence.n_sites), n_values, compute)
-        field_um, none = incidence.field_um, np.zeros(incidence.n_sites, np.int64)
+        n_sites, none = incidence.n_sites, np.zeros(incidence.n_sites, np.int64)
         step_um = NODE_STEP * min(incidence.um_per_tangent, math.inf if design is None else design.um_per_tangent)
-        if not math.isfinite(step_um) and incidence.covers(field_um, design).all():  # all cones are the same
-            return np.repeat(compute(incidence.at(field_um[:1]), none[:1]), incidence.n_sites, axis=0)
+        if not math.isfinite(step_um) and incidence.covers(incidence.field_um, design).all():  # all cones are the same
+            return np.repeat(compute(incidence.at(incidence.positions_um(none[:1])), none[:1]), n_sites, axis=0)
         # Column by column: many times faster than a reduction along axis 0.
-        low, high = (
-            np.floor(np.array([find(field_um[:, axis]) for axis in (0, 1)]) / step_um) for find in (np.min, np.max)
-        )
+        axes_um = incidence.axes_um or incidence.field_um.T
+        low, high = (np.floor(np.array([find(axis) for axis in axes_um]) / step_um) for find in (np.min, np.max))
         if not math.isfinite(step_um) or np.prod(high - low + 2.0) > MAX_NODES:  # a table with a step in its angles
             return _in_blocks(incidence, none, n_values, compute)
         n_x, n_y = (high - low).astype(np.int64) + 2
@@ -103,21 +102,40 @@ class Shapes(NamedTuple):
         nodes_um = np.stack(np.meshgrid(columns * step_um, rows * step_um), axis=-1).reshape(-1, 2)
         values = np.full((nodes_um.shape[0], n_values), np.nan)
         used = np.arange(n_x * n_y)
-        if used.size > 4 * field_um.shape[0]:
-            used = _nodes_near(field_um / step_um - low, n_x)
+        if used.size > 4 * n_sites:
+            used = _nodes_near(incidence.field_um / step_um - low, n_x)
         used = used[incidence.covers(nodes_um[used], design)]
         values[used] = _in_blocks(incidence.at(nodes_um[used]), np.zeros(used.size, np.int64), n_values, compute)
-        found = np.empty((incidence.n_sites, n_values))
-        nodes = values.reshape(n_y, n_x, n_values)
-
-        def block(rows_of: slice) -> None:
-            _kernels.interpolate(field_um[rows_of], step_um, low[0], low[1], nodes, found[rows_of])
-
-        parallel_map(block, _blocks(incidence.n_sites), thread_count())
+        found = _interpolate(incidence, step_um, low, values.reshape(n_y, n_x, n_values))
         if used.size < values.shape[0]:
             alone = np.flatnonzero(np.isnan(found).any(axis=1))
-            found[alone] = _in_blocks(incidence.at(field_um[alone]), none[alone], n_values, compute)
+            found[alone] = _in_blocks(incidence.at(incidence.positions_um(alone)), none[alone], n_values, compute)
         return found
+
+
+def _interpolate(incidence: Incidence, step_um: float, low: Floats, nodes: Floats) -> Floats:
+    """Return values at sites between nodes (n_y, n_x, n_value), (n_site, n_value), computed in threads."""
+    from foveasim.sensor.pixel_optics import _kernels
+
+    found = np.empty((incidence.n_sites, nodes.shape[2]))
+    axes_um = incidence.axes_um
+    if axes_um is None:
+        field_um = incidence.field_um
+
+        def block(part: slice) -> None:
+            _kernels.interpolate(field_um[part], step_um, low[0], low[1], nodes, found[part])
+
+        n_rows, n_per_block = incidence.n_sites, ROWS
+    else:
+        x_um, y_um = axes_um
+        lines = found.reshape(y_um.size, x_um.size, nodes.shape[2])
+
+        def block(part: slice) -> None:
+            _kernels.interpolate_rows(x_um, y_um[part], step_um, low[0], low[1], nodes, lines[part])
+
+        n_rows, n_per_block = y_um.size, max(SITES_PER_BLOCK // x_um.size, 1)
+    parallel_map(block, _blocks(n_rows, n_per_block), thread_count())
+    return found
 
 
 def _nodes_near(position: Floats, n_x: int) -> Ints:
@@ -127,18 +145,19 @@ def _nodes_near(position: Floats, n_x: int) -> Ints:
     return np.unique(np.concatenate([corner, corner + 1, corner + n_x, corner + n_x + 1]))
 
 
-def _blocks(n_rows: int) -> list[slice]:
-    return [slice(first, min(first + ROWS, n_rows)) for first in range(0, n_rows, ROWS)]
+def _blocks(n_rows: int, n_per_block: int = ROWS) -> list[slice]:
+    return [slice(first, min(first + n_per_block, n_rows)) for first in range(0, n_rows, n_per_block)]
 
 
 def _in_blocks(
     incidence: Incidence, site_of: Ints, n_values: int, compute: Callable[[Incidence, Ints], Floats]
 ) -> Floats:
     """Return the values of all rows, computed in threads."""
+    field_um = incidence.field_um
     found = np.empty((site_of.size, n_values))
 
     def block(rows: slice) -> None:
-        found[rows] = compute(incidence.at(incidence.field_um[rows]), site_of[rows])
+        found[rows] = compute(incidence.at(field_um[rows]), site_of[rows])
 
     parallel_map(block, _blocks(site_of.size), thread_count())
     return found
@@ -154,6 +173,14 @@ def _one_of_lattice(sites: Photosites) -> Outlines | None:
         if np.ptp(width_um) > CONGRUENT * width_um[0]:
             return None
     return Outlines(*lattice.rings(0, 1))
+
+
+def smallest_area_um2(sites: Photosites) -> float:
+    """Return the smallest area of some sites, µm², inf for none."""
+    lattice = getattr(sites, "lattice", None)
+    if lattice is None or not lattice.n_sites:
+        return float(sites.area_um2.min(initial=np.inf))
+    return math.prod(float((high - low).min()) for low, high in (lattice.x_um.T, lattice.y_um.T))
 
 
 def _are_congruent(outlines: Outlines, centre_um: Floats) -> bool:
@@ -196,9 +223,15 @@ def inset(name: str, outlines: Outlines, margin_um: float) -> Outlines:
     """
     if margin_um == 0.0:
         return outlines
+    from foveasim.sensor.pixel_optics import _kernels
+
+    inset_um = np.empty_like(outlines.xy_um)
+    rings = outlines.xy_um, outlines.ring_offsets, outlines.site_offsets
+    if _kernels.inset_convex(*rings, margin_um, inset_um):
+        return Outlines(inset_um, *rings[1:])
     import shapely
 
-    shrunk, bad = shrink_polygons(polygons_of(outlines.xy_um, outlines.ring_offsets, outlines.site_offsets), margin_um)
+    shrunk, bad = shrink_polygons(polygons_of(*rings), margin_um)
     if bad.size:
         raise GeometryError(
             f"the {name} of site {bad[0]} would vanish or split into parts with an inset of {margin_um:g} µm; reduce "

@@ -69,9 +69,12 @@ class Footprints:
 
     def __post_init__(self) -> None:
         response = finite_array("response", self.response, ndim=1, at_least=0.0, at_most=1.0 + FRACTION_ROUNDING)
-        ratio = np.broadcast_to(finite_array("area_ratio", self.area_ratio, above=0.0), response.shape)
-        object.__setattr__(self, "response", read_only(np.minimum(response, 1.0)))
-        object.__setattr__(self, "area_ratio", read_only(ratio))
+        if response.size and response.max() > 1.0:
+            response = np.minimum(response, 1.0)
+        object.__setattr__(self, "response", read_only(response))
+        if not isinstance(self.area_ratio, float):
+            ratio = finite_array("area_ratio", self.area_ratio, above=0.0)
+            object.__setattr__(self, "area_ratio", read_only(np.broadcast_to(ratio, response.shape)))
         if self.mixing is not None:
             collected = response + np.asarray(self.mixing.sum(axis=0)).ravel()
             if response.size and not (largest := float(collected.max())) <= 1.0 + FRACTION_ROUNDING:
@@ -80,17 +83,23 @@ class Footprints:
     @cached_property
     def factor(self) -> Floats:
         """Factor on the power within the outlines, (n_site,): response over ratio of areas."""
-        return read_only(self.response / self.area_ratio)
+        return (
+            self.response
+            if np.ndim(self.area_ratio) == 0 and self.area_ratio == 1.0
+            else read_only(self.response / self.area_ratio)
+        )
 
-    def apply(self, rate_e_per_s: Floats) -> Floats:
+    def apply(self, rate_e_per_s: Floats, *, out: Floats | None = None) -> Floats:
         """
         Return the rates of photoelectrons, given those within the outlines, (n_site,) e-/s.
 
         The rate within the outline of a site is that within the outlines, over the ratio of their areas.
-        Light that meets the photodiode of another site has passed the filter of its own site.
+        Light that meets the photodiode of another site has passed the filter of its own site. ``out``: array for the result,
+        such as the rates.
         """
-        collected = rate_e_per_s * self.factor
-        return collected if self.mixing is None else collected + self.mixing @ (rate_e_per_s / self.area_ratio)
+        mixed = None if self.mixing is None else self.mixing @ (rate_e_per_s / self.area_ratio)
+        collected = np.multiply(rate_e_per_s, self.factor, out=out)
+        return collected if mixed is None else np.add(collected, mixed, out=collected)
 
 
 class PixelOptics(ABC):

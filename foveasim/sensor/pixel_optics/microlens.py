@@ -16,7 +16,7 @@ from foveasim.fields import Outlines
 from foveasim.incidence import ChiefRayTable, Incidence
 from foveasim.sensor.effects.contract import Photosites
 from foveasim.sensor.pixel_optics._layers import Layers, as_layers
-from foveasim.sensor.pixel_optics._shapes import Shapes, as_outlines, inset
+from foveasim.sensor.pixel_optics._shapes import Shapes, as_outlines, inset, smallest_area_um2
 from foveasim.sensor.pixel_optics.aperture_stack import INSET
 from foveasim.sensor.pixel_optics.contract import PIXEL_OPTICS, Footprints, PixelOptics
 
@@ -120,7 +120,7 @@ class Microlens(PixelOptics):
 
     def optical_opening_um(self, sites: Photosites) -> float:
         """Return the size of the smallest site times the index of the top layer, µm."""
-        return float(np.atleast_1d(self.refractive_index)[0] * np.sqrt(sites.area_um2.min(initial=np.inf)))
+        return float(np.atleast_1d(self.refractive_index)[0] * np.sqrt(smallest_area_um2(sites)))
 
     def shift_um(self, incidence: Incidence) -> Floats:
         """
