@@ -113,25 +113,25 @@ class Shapes(NamedTuple):
         return found
 
 
-def _interpolate(incidence: Incidence, step_um: float, low: Floats, nodes: Floats) -> Floats:
-    """Return values at sites between nodes (n_y, n_x, n_value), (n_site, n_value), computed in threads."""
+def _interpolate(incidence: Incidence, step_um: float, low: Floats, values: Floats) -> Floats:
+    """Return values at sites between nodes (n_y, n_x, n_value), (n_site, n_value)."""
     from foveasim.sensor.pixel_optics import _kernels
 
-    found = np.empty((incidence.n_sites, nodes.shape[2]))
+    found = np.empty((incidence.n_sites, values.shape[2]))
     axes_um = incidence.axes_um
     if axes_um is None:
         field_um = incidence.field_um
 
         def block(part: slice) -> None:
-            _kernels.interpolate(field_um[part], step_um, low[0], low[1], nodes, found[part])
+            _kernels.interpolate(field_um[part], step_um, low[0], low[1], values, found[part])
 
         n_rows, n_per_block = incidence.n_sites, ROWS
     else:
         x_um, y_um = axes_um
-        lines = found.reshape(y_um.size, x_um.size, nodes.shape[2])
+        lines = found.reshape(y_um.size, x_um.size, values.shape[2])
 
         def block(part: slice) -> None:
-            _kernels.interpolate_rows(x_um, y_um[part], step_um, low[0], low[1], nodes, lines[part])
+            _kernels.interpolate_rows(x_um, y_um[part], step_um, low[0], low[1], values, lines[part])
 
         n_rows, n_per_block = y_um.size, max(SITES_PER_BLOCK // x_um.size, 1)
     parallel_map(block, _blocks(n_rows, n_per_block), thread_count())
