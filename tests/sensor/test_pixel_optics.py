@@ -232,6 +232,20 @@ def test_affine_outlines_have_moments_of_mean_overlap(layout, angle_deg):
         assert found.response[site] == pytest.approx(expected[0] / layout.area_um2[site], abs=1e-2)  # few rays, kinks
 
 
+def test_quadratic_maps_are_sampled_exactly_at_second_order():
+    layout = RINGS[[97]].translate(*-RINGS[[97]].centroid_um[0])
+    cones = at_angle(layout, 17.0).with_rings(6)
+    grid = fs.Grid.centred((300, 300), 0.04)
+    x, y = np.meshgrid(*(np.linspace(-5.98, 5.98, 300),) * 2)
+    cells = 1.0 + 0.05 * x - 0.03 * y + 0.01 * x * x - 0.02 * x * y + 0.015 * y * y + 0.025 * 0.04**2 / 12  # cell means
+    found, overlaps = STACK.footprints(layout, cones), fs.Layout.from_polygons(clipped(layout, cones, STACK, 0))
+    weights = cones.weights[0]
+    expected = weights @ fs.Integrator(overlaps, grid, order=2)(cells) / (weights @ overlaps.area_um2)
+
+    mean = fs.Integrator(found.outlines, grid, order=2)(cells) / (found.area_ratio * layout.area_um2)
+    np.testing.assert_allclose(mean, expected, rtol=1e-9)
+
+
 def blurred_map():
     """Return a photograph blurred by 1.5 µm, in cells of 0.25 µm."""
     picture = gaussian_filter(skimage.data.camera().astype(np.float64), 1.5 / 0.25)
