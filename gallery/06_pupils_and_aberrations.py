@@ -2,7 +2,7 @@
 How do the pupil shape and the aberrations of a lens affect the images of a point and of a letter?
 
 New here: ``Optics(pupil=, zernike=, seidel=, focus_distance_m=)``, ``Optics.psf``, ``.mtf``, ``.strehl``,
-``.isoplanatic_error``.
+``.field_error``.
 
 Expect: diffraction spikes perpendicular to edges and vanes; a coma flare in +y, where its wavefront error increases; Strehl
 ratios of 0.814 to 0.817 for 1/14 wave rms of any aberration; a field of points with flares away from the axis, computed with
@@ -130,7 +130,7 @@ def main(out_dir: Path) -> None:
         strehl = aberrated.strehl(WAVELENGTH_NM)
         print(f"{name:>12}: Strehl {strehl:.4f} for 1/14 wave rms")
         assert abs(strehl - np.exp(-((2.0 * np.pi * MARECHAL_WAVES) ** 2))) < 4e-3
-    displaced = field.isoplanatic_error(points)
+    displaced = field.field_error(points)
     print(f"7 x 7 isoplanatic patches displace up to {displaced:.1%} of the PSF energy")
     assert abs(displaced - 0.335) < 0.02
     coma = all_lenses["coma in y"].psf(WAVELENGTH_NM)

@@ -34,6 +34,8 @@ __all__ = ["VARIABLES", "Imaging"]
 
 #: Variables of a lens.
 VARIABLES = ("zernike", "seidel", "defocus", "pupil")
+#: Isoplanatic patches along each side of the picture by default.
+PATCHES = 5
 #: Coefficients of Seidel aberrations, in the order of the tensor.
 SEIDEL_NAMES = ("spherical_um", "coma_um", "astigmatism_um", "field_curvature_um")
 #: Largest number of aliases per side of a lens with variables; more would take minutes.
@@ -74,6 +76,7 @@ class Imaging(nn.Module):
 
     Notes
     -----
+    Where aberrations vary over the field, isoplanatic patches replace modes: ``optics.field_patches``, by default 5.
     Padding, and the sampling of the aperture, are those of the initial lens: start with aberrations of the size that you
     expect, or set ``padding_cells``. Variations of a lens whose initial OTF is that of the clear circle use the sampled
     aperture, whose OTF is accurate to 7e-4.
@@ -91,6 +94,8 @@ class Imaging(nn.Module):
         self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
         initial = optics.resolve_oversample(scene)
         self._optics = replace(initial, precision="double")
+        if initial.is_varying and initial.field_patches is None:
+            self._optics = replace(self._optics, field_patches=PATCHES)
         if self.wrt and self._optics.zernike is None and self._optics.seidel is None and not self._optics.pupil:
             # A sampled aperture without aberrations.
             self._optics = replace(self._optics, zernike=Zernike(coefficients={4: 0.0}))

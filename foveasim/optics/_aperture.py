@@ -251,19 +251,45 @@ class Aperture:
         sample positions along either axis, in aperture radii. ``power``: sum of the squared amplitudes in the limit of fine
         sampling.
         """
-        n = math.ceil(n_across)
         pitch = 2.0 / n_across
-        fine = self._sample_pupil(wavelength_nm, max(PUPIL_POINTS, n))
-        mean = overlaps(n, pitch, fine.shape[0], 2.0 / fine.shape[0])
-        amplitude = mean @ (mean @ fine).T
+        shape = self._mean_pupil(wavelength_nm, n_across)
+        n = shape.shape[0]
         at: Floats = np.asarray((np.arange(n) - 0.5 * (n - 1)) * pitch, np.float64)
-        amplitude = amplitude.T * np.exp(
+        amplitude = shape * np.exp(
             2j
             * np.pi
             / float(um_from_nm(wavelength_nm))
             * self.path_um(at[np.newaxis, :], at[:, np.newaxis], wavelength_nm, field_um)
         )
         return amplitude, at, self.transmittance(wavelength_nm) * np.pi / pitch**2
+
+    def _mean_pupil(self, wavelength_nm: float, n_across: float) -> NDArray[Any]:
+        """Return the amplitudes of the pupil, averaged over the squares around the samples."""
+        key = "mean", 0.0 if self.is_achromatic else wavelength_nm, n_across
+        if self._cache.get("mean of", None) != key:
+            n = math.ceil(n_across)
+            fine = self._sample_pupil(wavelength_nm, max(PUPIL_POINTS, n))
+            mean = overlaps(n, 2.0 / n_across, fine.shape[0], 2.0 / fine.shape[0])
+            self._cache["mean"] = (mean @ (mean @ fine).T).T
+            self._cache["mean of"] = key
+        return np.asarray(self._cache["mean"])
+
+    def sampled_psf(
+        self, wavelength_nm: float, n_across: int, radius: int, field_um: tuple[float, float], real: Any
+    ) -> NDArray[np.floating[Any]]:
+        """
+        Sample the PSF at multiples of λN/2, up to ``radius`` of them along each axis.
+
+        ``n_across``: samples across the aperture. Returns (2 radius + 1, 2 radius + 1), of unit sum over all multiples.
+        """
+        import scipy.fft
+
+        amplitude, _, power = self.samples(wavelength_nm, n_across, field_um)
+        amplitude = amplitude.astype(np.result_type(real, np.complex64))
+        wave = scipy.fft.fft2(amplitude, (2 * n_across, 2 * n_across), overwrite_x=True)
+        multiples = np.arange(-radius, radius + 1)
+        near = wave[np.ix_(multiples, multiples)]
+        return np.asarray((near.real**2 + near.imag**2) / real(4 * n_across * n_across * power))
 
     def compute_otf(
         self,

@@ -7,15 +7,17 @@ scene behind three colour filters, the maps are summed together: each basis imag
 maps and dropped. In other groups the spectra of all basis images are stored, and maps are computed when they are requested.
 Memory is therefore limited to one spectrum per map or basis image, the smaller number of the two, plus one, and to one map.
 
-Where aberrations differ over the field, the picture is divided into overlapping isoplanatic patches with linear weights, each
-with the PSF at its own centre (overlap-add). This interpolates the PSF linearly between patch centres.
+Where aberrations differ over the field, the PSFs are a sum of modes, :mod:`foveasim.optics._field_modes`: a basis image times
+the weights of a mode is another basis image, and a wavelength of a mode another wavelength. Or the picture is divided into
+overlapping isoplanatic patches with linear weights, each with the PSF at its own centre (overlap-add), which interpolates the
+PSF linearly between patch centres.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -29,6 +31,7 @@ from foveasim._core.validation import Floats, Images, Ints
 from foveasim._io.mapped_files import in_memory
 from foveasim.fields import Grid
 from foveasim.optics._aperture import Aperture
+from foveasim.optics._field_modes import FieldWeight
 from foveasim.optics._transform import Factor, Transform, source_pixels
 from foveasim.optics.otf import Tables
 
@@ -82,10 +85,13 @@ class Imaging:
     """Inputs of the computation of power maps."""
 
     basis: Images
-    # On-axis irradiance in each band for an image value of 1, (n_basis, n_wavelength).
+    # On-axis irradiance in each band for an image value of 1, (n_basis, n_wavelength). With modes of the field, images are
+    # those of each mode times its weights, one after another, and wavelengths those of each mode.
     irradiance_w_m2: Floats
     # Weights of the outputs, (n_output, n_wavelength).
     weights: Floats
+    # Weights of the modes but the mean over the field.
+    field_weights: Sequence[FieldWeight]
     # Squared tangents of the angles to the axis, (n_x,) and (n_y,), and exponent of the cosine.
     tangent2_x: Floats
     tangent2_y: Floats
@@ -161,11 +167,15 @@ class Imaging:
         return Transform(self, rows, columns, shape)
 
     def maps(self, table_of: Tables) -> Iterator[MapRows]:
-        """Yield maps with the same PSF over the whole field; their rows are computed on demand."""
+        """Yield maps with one PSF, or with modes of the field; their rows are computed on demand."""
         transform = self.transform(*self.sources(), self.grid.shape)
 
         def write_spectrum(b: int, out: NDArray[Any]) -> None:
-            transform.forward(in_memory(self.basis[b]), self.tangent2_x, self.tangent2_y, self.falloff_power, out)
+            b, mode = divmod(b, 1 + len(self.field_weights))
+            weight = self.field_weights[mode - 1] if mode else None
+            transform.forward(
+                in_memory(self.basis[b]), self.tangent2_x, self.tangent2_y, self.falloff_power, out, weight
+            )
 
         return self._maps(transform, write_spectrum, lambda weight: self.cached_factor(weight, transform, table_of))
 

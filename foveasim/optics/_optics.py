@@ -24,11 +24,12 @@ from foveasim.incidence import N_RINGS, N_RINGS_OF_PUPILS, ChiefRayTable, Incide
 from foveasim.optics._aperture import Aperture, Wavefront, overlaps
 from foveasim.optics._point_images import Point, PointImages
 from foveasim.optics.aberrations import LateralColour, Seidel, Zernike
-from foveasim.optics.otf import MAX_ALIASES, PlaneTables, RadialTables, TableCache, Tables
+from foveasim.optics.otf import MAX_ALIASES, ONE_POINT, PlaneTables, RadialTables, TableCache, Tables
 from foveasim.optics.pupils import Pupil
 from foveasim.units import m_from_mm, m_from_um, um_from_m, um_from_nm
 
 if TYPE_CHECKING:
+    from foveasim.optics._field_modes import FieldModes
     from foveasim.optics._imaging import Imaging, MapRows
     from foveasim.optics._transform import Factor, Transform
 
@@ -113,9 +114,14 @@ class Optics(PointImages):
         distances are defocused.
     lateral_colour : LateralColour, optional
         Image size per wavelength. Outside a smaller image the power map is 0.
-    field_patches : int
-        Isoplanatic patches along each side of the picture, where aberrations vary over the field; the PSF is interpolated
-        linearly between them. Energy beyond the reach of a patch, 0.2 % of the PSF, may be displaced.
+    field_tolerance : float
+        Fraction of the light of a point that may be displaced where aberrations vary over the field: half the integral of the
+        absolute difference of the PSFs. The PSFs at 9 x 9 points of the picture are a sum of modes, whose number follows.
+    field_modes : "auto" or int
+        Number of modes in addition to the mean PSF, instead of the tolerance.
+    field_patches : int, optional
+        Isoplanatic patches along each side of the picture instead of modes; the PSF is interpolated linearly between them. Many
+        times slower. Energy beyond the reach of a patch, 0.2 % of the PSF, may be displaced.
     source_pixel : {"point", "square"}
         Whether a scene pixel emits from its centre (the paper) or uniformly from its square.
     oversample : int or "auto"
@@ -181,7 +187,9 @@ class Optics(PointImages):
     seidel: Seidel | None = None
     focus_distance_m: Annotated[float | None, Usual(0.05, 100.0)] = None
     lateral_colour: LateralColour | None = None
-    field_patches: Annotated[int, Limits(at_least=1, at_most=64), Usual(1, 15)] = 5
+    field_patches: Annotated[int | None, Limits(at_least=1, at_most=64), Usual(1, 15)] = None
+    field_tolerance: Annotated[float, Limits(above=0.0, at_most=1.0), Usual(0.001, 0.1)] = 0.01
+    field_modes: Annotated[int | Literal["auto"], Limits(at_least=0, at_most=80), Usual(0, 24)] = "auto"
     source_pixel: Literal["point", "square"] = "point"
     oversample: Annotated[int | Literal["auto"], Limits(at_least=1, at_most=MAX_OVERSAMPLE)] = "auto"
     padding: Literal["reflect", "edge", "zero", "periodic"] = "reflect"
@@ -213,11 +221,11 @@ class Optics(PointImages):
             object.__setattr__(self, "exit_pupil_mm", distance_mm)
             if self.chief_ray is not None:
                 raise ParameterError("exit_pupil_mm", "must not be given with 'chief_ray'", distance_mm, "mm")
-        if self._is_varying() and self.padding == "periodic":
+        if self.field_patches is not None and self.is_varying and self.padding == "periodic":
             raise ParameterError(
                 "padding",
-                "must not be 'periodic' with aberrations that vary over the field",
-                hint="choose 'reflect', 'edge' or 'zero': the field position in a periodic picture is undefined",
+                "must not be 'periodic' with 'field_patches'",
+                hint="choose 'reflect', 'edge' or 'zero', or omit 'field_patches': patches beyond the picture are undefined",
             )
 
     # -- geometry -------------------------------------------------------------------------------------------------
@@ -588,14 +596,15 @@ class Optics(PointImages):
         from foveasim.optics._imaging import isoplanatic_maps
 
         imaging, tables_at = self.imaging(scene, weights, grid=grid, n_threads=n_threads)
-        if not self._is_varying():
+        if self.field_patches is None or not self.is_varying:
             return imaging.maps(tables_at((0.0, 0.0)))
         return isoplanatic_maps(imaging, self.n_patches, tables_at)
 
     @property
     def n_patches(self) -> tuple[int, int]:
         """Numbers of isoplanatic patches along y and x."""
-        return (self.field_patches, self.field_patches) if self._is_varying() else (1, 1)
+        n = self.field_patches
+        return (1, 1) if n is None or not self.is_varying else (n, n)
 
     def imaging(
         self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int = 1
@@ -613,7 +622,7 @@ class Optics(PointImages):
         imaging : Imaging
             Geometry, padding and weights.
         tables_at : callable
-            OTF tables for the image point (x, y), µm.
+            OTF tables for the image point (x, y), µm; with modes of the field, those of all modes.
         """
         from foveasim.optics._imaging import Imaging
 
@@ -633,9 +642,18 @@ class Optics(PointImages):
             * transmittance
             * self.irradiance_per_radiance(scene.distance_m)
         )
+        modes = self._field_modes(scene, n_threads) if self._has_modes() else None
+        if modes is not None:
+            # Mode k of image b is an image, and mode k of wavelength λ a wavelength.
+            n_modes = modes.n_modes
+            irradiance_w_m2 = np.einsum("bw,kl->bklw", irradiance_w_m2, np.eye(n_modes)).reshape(
+                -1, n_modes * irradiance_w_m2.shape[1]
+            )
+            weights = np.tile(weights, n_modes)
         tangent2_x, tangent2_y = self._squared_tangents(scene)
         # Cache key: a factor depends on these, the lens and the weights.
-        spectrum_key = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um, self._n_fine
+        place = None if modes is None else grid.bounds_um
+        spectrum_key = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um, self._n_fine, place
 
         def cached_factor(weight: Floats, transform: Transform, table_of: Tables) -> Factor:
             # Factors of a clear circle are real and even.
@@ -653,6 +671,7 @@ class Optics(PointImages):
             irradiance_w_m2=irradiance_w_m2
             * (_pitch_um(scene) * self.magnification(scene.distance_m) / pixels.pitch_x_um) ** 2,
             weights=weights,
+            field_weights=[] if modes is None else modes.weights(pixels.shape),
             tangent2_x=tangent2_x,
             tangent2_y=tangent2_y,
             falloff_power=4 if self.emission == "lambertian" else 3,
@@ -675,21 +694,28 @@ class Optics(PointImages):
             if is_clear_circle:
                 return RadialTables(1.0 / lambda_n_um, self._real_type())
 
-            def create() -> PlaneTables:
-                return PlaneTables(aperture, scene.wavelength_nm, lambda_n_um, field_um, self._real_type())
+            points_um, combinations = [field_um], ONE_POINT
+            if modes is not None:
+                points_um = [(float(x_um), float(y_um)) for x_um, y_um in modes.points_um]
+                combinations = modes.combinations
 
-            return self._cache.prepare(spectrum_key[:2], field_um, create, imaging.sums())
+            def create() -> PlaneTables:
+                return PlaneTables(
+                    aperture, scene.wavelength_nm, lambda_n_um, points_um, self._real_type(), combinations, n_threads
+                )
+
+            return self._cache.prepare(spectrum_key[:2], place or field_um, create, imaging.sums())
 
         return imaging, tables_at
 
-    def isoplanatic_error(self, scene: SceneLike) -> float:
+    def field_error(self, scene: SceneLike) -> float:
         """
-        Return the largest fraction of PSF energy displaced by the isoplanatic patches.
+        Return the largest fraction of the light of a point that is displaced.
 
-        This is half the integral of the absolute difference between the PSF midway between patch centres and the mean of the
-        PSFs there. The PSF is exact at patch centres, and for a smooth field dependence this is the largest error. It
-        decreases with the square of ``field_patches``. For a single patch, the corners of the picture are compared with its
-        centre.
+        This is half the integral of the absolute difference between the PSF at a point of the field and that of the maps: of
+        modes, at the points that determine them and midway between these; of isoplanatic patches, midway between their centres,
+        where it decreases with the square of ``field_patches``. For a single patch, the corners of the picture are compared
+        with its centre.
 
         Parameters
         ----------
@@ -698,18 +724,49 @@ class Optics(PointImages):
         Returns
         -------
         fraction : float
-            Maximum over wavelengths and neighbouring patches; 0 for a constant PSF.
+            Maximum over wavelengths and points; 0 for a constant PSF.
         """
         from foveasim.optics._imaging import isoplanatic_error
 
-        grid = self.grid(scene)
-        if not self._is_varying():
+        grid, n = self.grid(scene), self.field_patches
+        if not self.is_varying:
             return 0.0
-        aperture, n = self._aperture(scene.distance_m), self.field_patches
+        if n is None:
+            return self._field_modes(scene, thread_count(None)).displaced
+        aperture = self._aperture(scene.distance_m)
         return max(
             isoplanatic_error(aperture, grid, (n, n), float(wave_nm), float(near_um))
             for wave_nm, near_um in zip(scene.wavelength_nm, self._lambda_n_um(scene), strict=True)
         )
+
+    def _has_modes(self) -> bool:
+        return self.is_varying and self.field_patches is None
+
+    def _field_modes(self, scene: SceneLike, n_threads: int) -> FieldModes:
+        """Return the modes of the PSFs over a picture."""
+        from foveasim.optics._field_modes import find_modes
+
+        grid, aperture = self.grid(scene), self._aperture(scene.distance_m)
+        n_modes = None if self.field_modes == "auto" else self.field_modes
+        found: FieldModes = self._cache.modes(
+            (scene.wavelength_nm.tobytes(), scene.distance_m, grid.bounds_um),
+            lambda: find_modes(
+                aperture,
+                grid,
+                scene.wavelength_nm,
+                tolerance=self.field_tolerance,
+                n_modes=n_modes,
+                n_threads=n_threads,
+            ),
+        )
+        if n_modes is None and found.displaced > self.field_tolerance:
+            warn(
+                f"the PSF varies so much over the field that {found.n_modes} modes displace {found.displaced:.2g} of the "
+                f"light of a point, more than field_tolerance = {self.field_tolerance:g}; use a larger tolerance, or a "
+                "part of the picture",
+                SamplingWarning,
+            )
+        return found
 
     def _point(self, wavelength_nm: float, distance_m: float | None, field_um: tuple[float, float]) -> Point:
         wave_nm = float(wavelengths_nm("wavelength_nm", check_number("wavelength_nm", wavelength_nm))[0])
@@ -743,7 +800,9 @@ class Optics(PointImages):
             distance_m, lambda: Aperture(self._pupils(), wavefronts, self._defocus_um(distance_m))
         )
 
-    def _is_varying(self) -> bool:
+    @property
+    def is_varying(self) -> bool:
+        """Whether the PSF varies over the field."""
         return self.seidel is not None and self.seidel.is_varying
 
     @staticmethod
@@ -758,7 +817,7 @@ class Optics(PointImages):
         half_x_um, half_y_um = (0.5 * n * grid.pitch_x_um for n in grid.shape[::-1])
         x_um, y_um = grid.centre_um
         corners = [(x_um + sx * half_x_um, y_um + sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
-        return [(0.0, 0.0), *(corners if self._is_varying() else ())]
+        return [(0.0, 0.0), *(corners if self.is_varying else ())]
 
     def _blur_um(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats) -> float:
         """Return the largest geometric ray displacement on the sensor."""

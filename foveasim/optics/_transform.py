@@ -31,6 +31,7 @@ from foveasim.errors import ParameterError, SimulationError
 from foveasim.optics.otf import MAX_ALIASES
 
 if TYPE_CHECKING:
+    from foveasim.optics._field_modes import FieldWeight
     from foveasim.optics._imaging import Imaging
 
 #: Callable of (first, last) that returns the columns of a transfer function, (last - first, n): real with the rows of
@@ -210,14 +211,24 @@ class Transform:
         """Numbers of columns and rows of the spectrum of a map."""
         return self._n_columns, self._n_rows
 
-    def forward(self, image: Images, x2: Floats, y2: Floats, falloff_power: int, out: NDArray[Any]) -> None:
-        """Write the spectrum of a picture with relative illumination and padding."""
+    def forward(
+        self,
+        image: Images,
+        x2: Floats,
+        y2: Floats,
+        falloff_power: int,
+        out: NDArray[Any],
+        weight: FieldWeight | None = None,
+    ) -> None:
+        """Write the spectrum of a padded picture with relative illumination and weights."""
         (n_y, _), (top, left) = self._picture_shape, self._n_before
         x2, y2 = x2.astype(self._real), y2.astype(self._real)
 
         def transform_rows(first: int, last: int) -> None:
             padded = np.empty((last - first, self._columns.size), self._real)
             rows = np.ascontiguousarray(image[first:last])
+            if weight is not None:
+                rows = rows * weight.rows(first, last).astype(self._real)
             self._kernels.apply_falloff(rows, x2, y2[first:last], falloff_power, self._columns, left, padded)
             self._kernels.store_rows(scipy.fft.rfft(padded, axis=1, overwrite_x=True), top + first, out)
 

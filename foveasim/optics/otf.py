@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.threads import ForkSafeLock, cached_property
+from foveasim._core.threads import ForkSafeLock, cached_property, parallel_map
 from foveasim._core.validation import Floats, as_numbers
 from foveasim.optics._aperture import Aperture
 
@@ -22,7 +22,11 @@ MAX_ALIASES = 128
 #: Points of a radial table up to the smallest cut-off; the float32 table fits the L1 cache. The error of linear interpolation
 #: is at most 2.4e-7 of the value at zero frequency in float32 and 3.0e-8 in float64, near the cut-off.
 TABLE_POINTS: dict[Any, int] = {np.float32: 1 << 13, np.float64: 1 << 15}
-#: Largest number of cached apertures, one per scene distance.
+#: The OTF at one point of the field.
+ONE_POINT = np.ones((1, 1))
+#: Points of the field whose OTFs are computed in threads together.
+POINTS_TOGETHER = 8
+#: Largest number of cached apertures, and of modes over the field, one per scene distance.
 MAX_CACHED_APERTURES = 4
 #: Memory limit of the tables of all wavelengths, in numbers (128 MiB); beyond it, their step increases.
 MAX_TABLE_SIZE = 1 << 24
@@ -96,9 +100,11 @@ class RadialTables:
 
 class PlaneTables:
     """
-    Complex OTF tables over (f_y, f_x) of an arbitrary aperture, for one field point.
+    Complex OTF tables over (f_y, f_x) of an arbitrary aperture.
 
-    The sampling of the aperture is adapted to each wavelength, so that all OTFs have the same frequency step and can be added.
+    They are for one point of the field, or for modes of several. A mode is a sum of the PSFs at the points: its weights are a row of ``combinations`` (n_mode, n_point). The weights of a sum
+    are those of all wavelengths in the first mode, in the second, and so on. The sampling of the aperture is adapted to each
+    wavelength, so that all OTFs have the same frequency step and can be added.
     """
 
     def __init__(
@@ -106,43 +112,83 @@ class PlaneTables:
         aperture: Aperture,
         wavelength_nm: Floats,
         lambda_n_um: Floats,
-        field_um: tuple[float, float],
+        points_um: Sequence[tuple[float, float]],
         real: type[np.floating[Any]],
+        combinations: Floats = ONE_POINT,
+        n_threads: int = 1,
     ) -> None:
-        self._aperture, self._field_um, self._real = aperture, field_um, real
+        self._aperture, self._points_um, self._real = aperture, points_um, real
         self._wavelength_nm, self._lambda_n_um = wavelength_nm, lambda_n_um
+        self._combinations, self._n_threads = combinations, n_threads
         self._cache: dict[bytes, NDArray[Any]] = {}
+        self._sums: list[Floats] = []
 
     @cached_property
     def _per_step(self) -> float:
-        n_across = np.array([self._aperture.n_across(float(w), self._field_um) for w in self._wavelength_nm])
-        return float((n_across * self._lambda_n_um).max())
+        n_across = [
+            max(self._aperture.n_across(float(w), point) for point in self._points_um) for w in self._wavelength_nm
+        ]
+        return float((np.array(n_across) * self._lambda_n_um).max())
+
+    @cached_property
+    def _n_lags(self) -> int:
+        return math.ceil(self._per_step / float(self._lambda_n_um.min()))
 
     def prepare(self, weights: Sequence[Floats]) -> None:
-        """Compute the tables of several sums in one pass over the wavelengths."""
-        n_lags = math.ceil(self._per_step / float(self._lambda_n_um.min()))
-        max_cached = max(1, MAX_TABLE_SIZE // (2 * n_lags + 1) ** 2)
-        weights = [w for w in weights if w.tobytes() not in self._cache][:max_cached]
-        if len(self._cache) + len(weights) > max_cached:
+        """Compute the tables of several sums in one pass, up to the memory limit."""
+        self._sums = list(weights)
+        if weights:
+            self._compute(weights)
+
+    def _compute(self, weights: Sequence[Floats]) -> None:
+        n_cached = max(
+            1, (MAX_TABLE_SIZE if len(self._points_um) == 1 else MAX_CACHE_SIZE) // (2 * self._n_lags + 1) ** 2
+        )
+        weights = [w for w in weights if w.tobytes() not in self._cache][:n_cached]
+        if len(self._cache) + len(weights) > n_cached:
             self._cache.clear()
         if not weights:
             return
-        sums = np.zeros((len(weights), 2 * n_lags + 1, 2 * n_lags + 1), np.result_type(self._real, np.complex64))
-        for k in np.flatnonzero(np.any(weights, axis=0)):
+        of_mode = np.reshape(weights, (len(weights), len(self._combinations), -1))
+        # Sums over the wavelengths at each point, which modes share.
+        spectra, which = np.unique(of_mode.reshape(-1, of_mode.shape[2]), axis=0, return_inverse=True)
+        which = which.reshape(of_mode.shape[:2])
+        parts = np.stack([(which == k) @ self._combinations for k in range(len(spectra))], axis=1)
+        sums = np.zeros((len(weights), *(2 * self._n_lags + 1,) * 2), np.result_type(self._real, np.complex64))
+        n_points, n_together = len(self._points_um), POINTS_TOGETHER if self._aperture.is_achromatic else 1
+        for first in range(0, n_points, n_together):
+            at = range(first, min(first + n_together, n_points))
+            n_threads = self._n_threads if first else 1  # the first call samples the pupil, which all points share
+            found = parallel_map(lambda point: self._at_point(point, spectra), at, n_threads)
+            for p, tables in zip(at, found, strict=True):
+                for i, k in zip(*np.nonzero(parts[:, :, p]), strict=True):
+                    if tables[k] is not None:
+                        sums[i] += tables[k] if parts[i, k, p] == 1.0 else self._real(parts[i, k, p]) * tables[k]
+        self._cache |= {weight.tobytes(): total for weight, total in zip(weights, sums, strict=True)}
+
+    def _at_point(self, point: int, spectra: Floats) -> list[NDArray[Any] | None]:
+        """Return the OTF of each sum over wavelengths at a point, None for no wavelength."""
+        sums: list[NDArray[Any] | None] = [None] * len(spectra)
+        for k in np.flatnonzero(np.any(spectra, axis=0)):
             n_across = self._per_step / float(self._lambda_n_um[k])
             otf = self._aperture.compute_otf(
-                float(self._wavelength_nm[k]), n_across, n_lags, self._field_um, self._real
+                float(self._wavelength_nm[k]), n_across, self._n_lags, self._points_um[point], self._real
             )
-            for i, weight in enumerate(weights):
-                if weight[k]:
-                    sums[i] += self._real(weight[k]) * otf
-        self._cache |= {weight.tobytes(): total for weight, total in zip(weights, sums, strict=True)}
+            for i, weight in enumerate(spectra[:, k]):
+                if weight:
+                    part = self._real(weight) * otf
+                    total = sums[i]
+                    sums[i] = part if total is None else np.add(total, part, out=total)
+        return sums
 
     def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
         """Return the table, and its steps per frequency (µm)."""
-        if weight.tobytes() not in self._cache:
-            self.prepare([weight])
-        return self._cache[weight.tobytes()], self._per_step
+        key = weight.tobytes()
+        if key not in self._cache:
+            # With those that are requested next.
+            keys = [each.tobytes() for each in self._sums]
+            self._compute(self._sums[keys.index(key) :] if key in keys else [weight])
+        return self._cache[key], self._per_step
 
     @property
     def size(self) -> int:
@@ -160,7 +206,8 @@ class TableCache:
 
     def __init__(self) -> None:
         self._lock = ForkSafeLock()
-        self._tables: dict[tuple[Hashable, tuple[float, float]], PlaneTables] = {}
+        self._tables: dict[tuple[Hashable, Hashable], PlaneTables] = {}
+        self._modes: dict[Hashable, Any] = {}
         self._apertures: dict[float, Aperture] = {}
         self._factors: dict[tuple[Hashable, bytes], NDArray[Any] | None] = {}
 
@@ -176,24 +223,35 @@ class TableCache:
                 del self._apertures[next(iter(self._apertures))]
             return aperture
 
+    def modes(self, key: Hashable, create: Callable[[], Any]) -> Any:
+        """Return the modes of a field; the most recently used ones are cached."""
+        with self._lock:
+            found = self._modes.pop(key, None)
+        found = create() if found is None else found
+        with self._lock:
+            self._modes[key] = found
+            while len(self._modes) > MAX_CACHED_APERTURES:
+                del self._modes[next(iter(self._modes))]
+        return found
+
     def prepare(
         self,
         spectrum: Hashable,
-        field_um: tuple[float, float],
+        field: Hashable,
         create: Callable[[], PlaneTables],
         weights: Sequence[Floats],
     ) -> PlaneTables:
-        """Return tables for a spectrum and a field point, with the given weighted sums computed."""
+        """Return tables for a point or the modes of a field, with weighted sums computed."""
         with self._lock:
-            tables = self._tables.get((spectrum, field_um)) or create()
+            tables = self._tables.get((spectrum, field)) or create()
         tables.prepare(weights)
         with self._lock:
-            self._tables[spectrum, field_um] = tables
+            self._tables[spectrum, field] = tables
             for other in [key for key in self._tables if key[0] != spectrum]:
                 if self._size() > MAX_CACHE_SIZE:
                     del self._tables[other]
             if len(self._tables) > 1 and self._size() > MAX_CACHE_SIZE:
-                del self._tables[spectrum, field_um]
+                del self._tables[spectrum, field]
         return tables
 
     def factor(

@@ -111,7 +111,13 @@ ABERRATED = SHOT | {
         "padding": "zero",
     },
 }
-ABERRATIONS = ("optics.zernike", "optics.seidel", "optics.field_patches")
+ABERRATIONS = (
+    "optics.zernike",
+    "optics.seidel",
+    "optics.field_patches",
+    "optics.field_tolerance",
+    "optics.field_modes",
+)
 #: Alternatives of the radiance of a scene.
 LEVELS = ("scene.luminance_cd_m2", "scene.illuminance_lux", "scene.reflectance")
 #: Other values of settings whose type does not suggest one.
@@ -130,6 +136,8 @@ OTHERS = {
     "optics.seidel": {"spherical_um": 0.1},
     "optics.focus_distance_m": 0.9,
     "optics.oversample": 3,
+    "optics.field_modes": 3,
+    "optics.field_patches": 2,
     "optics.exit_pupil_mm": 2.0,
     "optics.chief_ray": {"image_height_um": [0.0, 1e4], "angle_deg": [0.0, 20.0]},
     "sensor.pixel_optics": {"kind": "microlens", "height_um": 3.0, "refractive_index": 1.5, "photodiode_inset_um": 0.3},
@@ -355,7 +363,11 @@ def test_cached_components_equal_fresh_ones(runner):
 def test_cached_aberrations_equal_fresh_ones(runner):
     values = list(varied(ABERRATED, aberrations=True))
 
-    assert compare_with_fresh(runner, ABERRATED, values) <= {"optics.field_patches"}
+    assert compare_with_fresh(runner, ABERRATED, values) <= {
+        "optics.field_patches",
+        "optics.field_tolerance",
+        "optics.field_modes",
+    }
 
 
 def test_cached_sections_equal_fresh_ones(runner):

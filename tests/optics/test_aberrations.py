@@ -359,7 +359,7 @@ def test_isoplanatic_error_decreases_with_patch_count():
         maps.append(map_of(optics, image, pitch_um=46.4).data[0])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", SamplingWarning)
-            errors.append(optics.isoplanatic_error(scene_of(image, pitch_um=46.4)) if n_patches < 11 else 0.0)
+            errors.append(optics.field_error(scene_of(image, pitch_um=46.4)) if n_patches < 11 else 0.0)
     truth = maps[-1]
     displaced = [0.5 * np.abs(m - truth).sum() / truth.sum() for m in maps]
 
@@ -372,8 +372,8 @@ def test_isoplanatic_error_decreases_with_patch_count():
     assert displaced[0] > 0.1 * errors[0]
 
 
-def test_constant_psf_has_zero_isoplanatic_error():
-    assert aberrated(coefficients={7: 0.1}).isoplanatic_error(scene_of(np.ones((50, 50)))) == 0.0
+def test_constant_psf_has_no_field_error():
+    assert aberrated(coefficients={7: 0.1}).field_error(scene_of(np.ones((50, 50)))) == 0.0
 
 
 # -- lateral chromatic aberration ---------------------------------------------------------------------------------------
@@ -528,7 +528,10 @@ def test_zernike_is_hashable_and_immutable():
         ),
         (lambda: zernike(2, 1, 0.0, 0.0), "'m' must be from -n to n = 2 in steps of two, got 1"),
         (lambda: lens(zernike={4: 0.1}), "'zernike' must be a Zernike, got a dict"),
-        (lambda: lens(seidel=Seidel(coma_um=1.0)), "'padding' must not be 'periodic' with aberrations that vary"),
+        (
+            lambda: lens(seidel=Seidel(coma_um=1.0), field_patches=5),
+            "'padding' must not be 'periodic' with 'field_patches'",
+        ),
         (lambda: lens(focus_distance_m=0.02), "'focus_distance_m' must be larger than the focal length, 0.022 m"),
         (lambda: lens(focus_distance_m=-1.0), "'focus_distance_m' must be > 0"),
         (lambda: lens(field_patches=0), "'field_patches' must be >= 1"),

@@ -508,7 +508,7 @@ def test_otf_tables_are_cached_between_frames(monkeypatch):
     [
         ("power_map", ("x.png",), "'scene' must be a Scene, got a str"),
         ("grid", (None,), "'scene' must be a Scene, got a NoneType"),
-        ("isoplanatic_error", (np.ones((3, 3)),), "'scene' must be a Scene, got an ndarray"),
+        ("field_error", (np.ones((3, 3)),), "'scene' must be a Scene, got an ndarray"),
         ("weighted_maps", ("scene", np.ones((2, 2))), r"'weights' must have shape \(n_output, 1\)"),
         ("weighted_maps", ("scene", [1.0]), "'weights' must have 2 dimensions"),
         ("mtf", (np.ones(2), np.ones(3)), "'wavelength_nm' must be one number"),

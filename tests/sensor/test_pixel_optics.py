@@ -232,7 +232,7 @@ def test_affine_outlines_have_moments_of_mean_overlap(layout, angle_deg):
         assert found.response[site] == pytest.approx(expected[0] / layout.area_um2[site], abs=1e-2)  # few rays, kinks
 
 
-def test_quadratic_maps_are_sampled_exactly_at_second_order():
+def test_second_order_samples_quadratic_maps_exactly():
     layout = RINGS[[97]].translate(*-RINGS[[97]].centroid_um[0])
     cones = at_angle(layout, 17.0).with_rings(6)
     grid = fs.Grid.centred((300, 300), 0.04)

@@ -1,0 +1,220 @@
+"""
+PSFs that vary over the field, as a sum of modes.
+
+The PSFs h at points of the field are ``h(x) = h̄ + Σ_k w_k(x) u_k``: the mean, and the singular vectors u of the deviations with
+their weights w at the points, interpolated between them. The map of a source S is then ``h̄ ∗ S + Σ_k u_k ∗ (w_k S)``: one more
+forward transform per mode, and one inverse transform. The modes have a sum of 0, so that power is exact for any number of them.
+
+Sources: T. R. Lauer, Deconvolution with a spatially-variant PSF, Proc. SPIE 4847, 167 (2002); R. C. Flicker and F. J. Rigaut,
+Anisoplanatic deconvolution of adaptive optics images, J. Opt. Soc. Am. A 22, 504 (2005); L. Denis et al., Fast approximations
+of shift-variant blur, Int. J. Comput. Vis. 115, 253 (2015).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.threads import parallel_map
+from foveasim._core.validation import Floats
+from foveasim.fields import Grid
+from foveasim.optics._aperture import Aperture
+
+#: Points along each side of the picture at which PSFs are computed.
+FIELD_POINTS = 9
+#: Radius beyond the geometric blur, in λN, in which PSFs are compared: all but 1 % of the power of a clear circle.
+REACH_LAMBDA_N = 20.0
+#: Largest number of wavelengths whose PSFs determine the modes.
+MAX_WAVELENGTHS = 3
+#: Largest number of samples of all PSFs, 1 GiB in single precision: more wavelengths than one are omitted beyond it.
+MAX_SAMPLES = 1 << 28
+#: If the tolerance cannot be reached, the modes displace this multiple of the least possible.
+UNREACHED = 1.1
+#: Samples whose products are computed in double precision together.
+SAMPLES_TOGETHER = 1 << 16
+
+
+@dataclass(frozen=True, eq=False)
+class FieldWeight:
+    """
+    Weight of a mode at the pixels of a picture, ``along_y @ at_points @ along_x.T``.
+
+    ``along_y`` (n_y, n), ``along_x`` (n_x, n): interpolation from the points of the field. ``at_points`` (n, n).
+    """
+
+    along_y: Floats
+    at_points: Floats
+    along_x: Floats
+
+    def rows(self, first: int, last: int) -> Floats:
+        """Return the weights of some rows, (last - first, n_x)."""
+        weights: Floats = (self.along_y[first:last] @ self.at_points) @ self.along_x.T
+        return weights
+
+
+@dataclass(frozen=True, eq=False)
+class FieldModes:
+    """
+    Modes of the PSFs at the points of a field.
+
+    ``points_um`` (n_point, 2): x and y of the points, row by row. ``combinations`` (n_mode, n_point): each mode as a sum of the
+    PSFs at the points; that of the mean first, all others with the sum 0. ``at_points`` (n_mode, n, n): weights at the points.
+    ``singular_values`` (n_point - 1,): those of the deviations from the mean PSF, sampled at λN/2, over the root of the number
+    of wavelengths. ``displaced``: largest fraction of the light that the modes displace at the points and between them.
+    """
+
+    points_um: Floats
+    combinations: Floats
+    at_points: Floats
+    singular_values: Floats
+    displaced: float
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes, that of the mean included."""
+        return len(self.combinations)
+
+    def weights(self, shape: tuple[int, int]) -> list[FieldWeight]:
+        """Return the weights of all modes but the mean at the pixels of a picture."""
+        along_y, along_x = (interpolation(self.at_points.shape[1], (np.arange(n) + 0.5) / n) for n in shape)
+        return [FieldWeight(along_y, each, along_x) for each in self.at_points[1:]]
+
+
+def interpolation(n_points: int, at: Floats) -> Floats:
+    """Return the matrix (n, n_points) of cubic splines through equidistant points from 0 to 1."""
+    from scipy.interpolate import make_interp_spline
+
+    spline = make_interp_spline(np.linspace(0.0, 1.0, n_points), np.eye(n_points), k=min(3, n_points - 1))
+    return np.ascontiguousarray(spline(at))
+
+
+def field_points_um(grid: Grid, n_points: int) -> Floats:
+    """Return x and y of equidistant points from edge to edge of a picture, (n, n, 2) µm."""
+    x0_um, y0_um, x1_um, y1_um = grid.bounds_um
+    return np.stack(np.meshgrid(np.linspace(x0_um, x1_um, n_points), np.linspace(y0_um, y1_um, n_points)), axis=-1)
+
+
+def find_modes(
+    aperture: Aperture,
+    grid: Grid,
+    wavelength_nm: Floats,
+    *,
+    tolerance: float,
+    n_modes: int | None,
+    n_threads: int,
+    n_points: int = FIELD_POINTS,
+) -> FieldModes:
+    """
+    Return the modes of the PSFs over the field of a picture.
+
+    ``n_modes``: number without the mean; by default the smallest with which at most the fraction ``tolerance`` of the light is
+    displaced: half the L1 norm of the difference of the PSFs, at the points and midway between them.
+    """
+    every_um = field_points_um(grid, 2 * n_points - 1)
+    is_point, is_midway = (np.zeros(every_um.shape[:2], bool) for _ in range(2))
+    is_point[::2, ::2], is_midway[1::2, 1::2] = True, True
+    used = is_point | is_midway
+    psfs = sampled_psfs(aperture, every_um[used], wavelength_nm, n_threads)
+    of_point = is_point[used]
+    psfs -= psfs[of_point].mean(axis=0)
+    at_points = psfs[of_point].reshape(n_points * n_points, -1)
+    sizes, fields = _singular_vectors(at_points)
+    weights = everywhere(fields.reshape(-1, n_points, n_points))[:, used]
+    modes = fields.astype(psfs.dtype) @ at_points
+    if n_modes is None:
+        least = _displaced(psfs - _sum_of_modes(weights, modes, psfs.shape))
+        goal, n_most = max(tolerance, UNREACHED * least), len(fields)
+    else:
+        goal, n_most = 0.0, min(n_modes, len(fields))
+    n_found, displaced = _number_of_modes(psfs, weights, modes, goal, n_most)
+    n_all = n_points * n_points
+    return FieldModes(
+        every_um[is_point],
+        np.concatenate((np.full((1, n_all), 1.0 / n_all), fields[:n_found])),
+        np.concatenate((np.ones((1, n_all)), fields[:n_found])).reshape(-1, n_points, n_points),
+        sizes / math.sqrt(psfs.shape[1]),
+        displaced,
+    )
+
+
+def _singular_vectors(deviations: NDArray[Any]) -> tuple[Floats, Floats]:
+    """
+    Return the singular values and vectors of deviations from a mean.
+
+    (n_point - 1,) and (n_point - 1, n_point). There are far fewer points than samples: they are the eigenvectors of the products, orthogonal to the mean.
+    """
+    n_points, n_samples = deviations.shape
+    products = np.zeros((n_points, n_points))
+    for first in range(0, n_samples, SAMPLES_TOGETHER):
+        part = deviations[:, first : first + SAMPLES_TOGETHER].astype(np.float64)
+        products += part @ part.T
+    # All directions but that of the mean.
+    basis = np.linalg.qr(np.column_stack((np.ones(n_points), np.eye(n_points)[:, 1:])))[0][:, 1:]
+    squares, vectors = np.linalg.eigh(basis.T @ products @ basis)
+    return np.sqrt(np.maximum(squares[::-1], 0.0)), np.ascontiguousarray((basis @ vectors[:, ::-1]).T)
+
+
+def everywhere(fields: Floats) -> Floats:
+    """Return values (..., n, n) also midway, (..., 2n - 1, 2n - 1)."""
+    n_points = fields.shape[-1]
+    along = interpolation(n_points, np.linspace(0.0, 1.0, 2 * n_points - 1))
+    along[::2] = np.eye(n_points)
+    return np.asarray(along @ fields @ along.T)
+
+
+def _displaced(residual: NDArray[Any]) -> float:
+    """Return the largest fraction of light that differences of PSFs displace."""
+    return 0.5 * float(np.abs(residual).sum(axis=2).max())
+
+
+def _sum_of_modes(weights: Floats, modes: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return the sum of modes with weights (n_mode, n_point)."""
+    return np.asarray(weights.T.astype(modes.dtype) @ modes).reshape(shape)
+
+
+def _number_of_modes(
+    deviations: NDArray[Any], weights: Floats, modes: NDArray[Any], goal: float, n_most: int
+) -> tuple[int, float]:
+    """
+    Return the smallest number of modes for a fraction of displaced light.
+
+    And the fraction that they displace. ``deviations`` from the mean PSF are overwritten.
+    """
+    displaced = _displaced(deviations)
+    for k in range(n_most):
+        if displaced <= goal:
+            return k, displaced
+        deviations -= _sum_of_modes(weights[k : k + 1], modes[k : k + 1], deviations.shape)
+        displaced = _displaced(deviations)
+    return n_most, displaced
+
+
+def sampled_psfs(
+    aperture: Aperture, points_um: Floats, wavelength_nm: Floats, n_threads: int, real: Any = np.float32
+) -> NDArray[Any]:
+    """
+    Return samples of the PSFs at points of the field, at multiples of λN/2.
+
+    (n_point, n_wavelength, n_sample): at the shortest, a middle and the longest wavelength, in a square that contains the geometric blur of all points.
+    """
+    points = [(float(x_um), float(y_um)) for x_um, y_um in points_um]
+    waves_nm = np.unique(wavelength_nm)
+    blur = max(aperture.blur_lambda_n(float(wave_nm), point) for wave_nm in waves_nm for point in points)
+    n_across = max(aperture.n_across(float(wave_nm), point) for wave_nm in waves_nm for point in points)
+    radius = min(math.ceil(2.0 * (blur + REACH_LAMBDA_N)), n_across - 1)
+    n_samples = (2 * radius + 1) ** 2
+    n_waves = max(1, min(waves_nm.size, MAX_WAVELENGTHS, MAX_SAMPLES // (n_samples * len(points))))
+    waves_nm = waves_nm[np.linspace(0, waves_nm.size - 1, n_waves).round().astype(int)] if n_waves > 1 else waves_nm[:1]
+    psfs = np.empty((len(points), n_waves, n_samples), real)
+    for w, wave_nm in enumerate(waves_nm):
+
+        def compute(k: int, w: int = w, wave_nm: float = float(wave_nm)) -> None:
+            psfs[k, w] = aperture.sampled_psf(wave_nm, n_across, radius, points[k], real).ravel()
+
+        compute(0)  # samples the pupil, which all points share
+        parallel_map(compute, range(1, len(points)), n_threads)
+    return psfs

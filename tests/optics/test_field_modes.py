@@ -1,0 +1,202 @@
+"""Modes of PSFs that vary over the field: patches and single points as references, power, errors."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import foveasim as fs
+from foveasim.errors import ParameterError, SamplingWarning
+from foveasim.optics import LateralColour, Seidel, _field_modes
+from foveasim.optics._field_modes import find_modes, sampled_psfs
+
+pytestmark = pytest.mark.filterwarnings("ignore:the image of the scene is only")
+WAVES_NM = np.array([500.0, 600.0])
+SEIDEL = Seidel(coma_um=0.08, astigmatism_um=0.06, field_curvature_um=0.05, field_radius_um=30.0)
+LENS = fs.Optics(
+    focal_length_mm=8.0, f_number=4.0, seidel=SEIDEL, padding="zero", padding_cells=40, precision="double", oversample=1
+)
+
+
+def scene_of(image, pitch_um=100.0, waves_nm=WAVES_NM[:1]):
+    image = np.asarray(image, float).reshape(-1, *np.shape(image)[-2:])
+    spectra = np.random.default_rng(1).uniform(0.5, 1.0, (len(image), len(waves_nm)))
+    return fs.Scene(image, spectra, waves_nm, np.ones(len(waves_nm)), pitch_um, 1.0)
+
+
+def noise(n=48, n_basis=1, **options):
+    return scene_of(np.random.default_rng(0).random((n_basis, n, n + 6)), **options)
+
+
+@pytest.fixture
+def linear(monkeypatch):
+    """Weights that are linear between the points, as those of patches."""
+
+    def interpolate(n_points, at):
+        return np.stack([np.interp(at, np.linspace(0, 1, n_points), row) for row in np.eye(n_points)], axis=1)
+
+    monkeypatch.setattr(_field_modes, "interpolation", interpolate)
+
+
+# Cells of 0.4, 0.8 and 2.3 λN (aliases), finer cells, several basis images and wavelengths.
+@pytest.mark.parametrize(
+    ("options", "changes"),
+    [
+        ({}, {}),
+        ({"pitch_um": 200.0}, {"source_pixel": "square"}),
+        ({"pitch_um": 600.0}, {"seidel": replace(SEIDEL, field_radius_um=150.0)}),
+        ({"n_basis": 2, "waves_nm": WAVES_NM}, {}),
+        ({}, {"oversample": 2}),
+        ({}, {"oversample": 3, "emission": "isotropic"}),
+        ({"waves_nm": WAVES_NM}, {"lateral_colour": LateralColour(wavelength_nm=WAVES_NM, magnification=(0.98, 1.0))}),
+        ({}, {"zernike": fs.optics.Zernike(coefficients={7: 0.05})}),
+    ],
+)
+@pytest.mark.usefixtures("linear")
+def test_all_modes_equal_patches(options, changes):
+    scene, lens = noise(**options), replace(LENS, **changes)
+    patches = replace(lens, field_patches=9, padding_cells=lens.padding_cells).power_map(scene).data
+    modes = replace(lens, field_modes=80).power_map(scene).data
+
+    # Aliases are interpolated to 1e-4 of the peak, for transforms of other sizes; smaller images have their own patches.
+    tolerance = 1e-3 if options.get("pitch_um") == 600.0 else 5e-3 if "lateral_colour" in changes else 1e-11
+    np.testing.assert_allclose(modes, patches, atol=tolerance * patches.max())
+
+
+@pytest.mark.usefixtures("linear")
+def test_all_modes_equal_patches_in_single_precision():
+    scene, lens = noise(), replace(LENS, precision="single")
+    patches = replace(lens, field_patches=9).power_map(scene).data
+
+    np.testing.assert_allclose(replace(lens, field_modes=80).power_map(scene).data, patches, atol=2e-6 * patches.max())
+
+
+@pytest.mark.parametrize("padding", ["periodic", "zero", "reflect", "edge"])
+@pytest.mark.parametrize(("precision", "tolerance"), [("single", 1e-6), ("double", 1e-12)])
+def test_any_modes_conserve_power(padding, precision, tolerance):
+    image = np.zeros((100, 100))
+    image[40:60, 40:60] = np.random.default_rng(2).random((20, 20))
+    lens = replace(LENS, padding=padding, padding_cells=None if padding == "periodic" else 120, precision=precision)
+    scene = scene_of(image)
+    sums = [replace(lens, field_modes=k).power_map(scene).data.sum(dtype=np.float64) for k in (0, 3)]
+    fixed = replace(lens, seidel=None).power_map(scene).data.sum(dtype=np.float64)
+
+    limit = tolerance if padding == "periodic" else 3e-3  # beyond the picture
+    np.testing.assert_allclose(sums, fixed, rtol=limit)
+
+
+def test_modes_are_singular_vectors_of_psfs():
+    scene = noise()
+    aperture, grid = LENS.aperture(scene), LENS.grid(scene)
+    for k in (0, 2, 5, 11):
+        modes = find_modes(aperture, grid, scene.wavelength_nm, tolerance=1.0, n_modes=k, n_threads=1)
+        psfs = sampled_psfs(aperture, modes.points_um, scene.wavelength_nm, 1, np.float64)[:, 0]
+        sampled = modes.combinations @ psfs
+        found = modes.at_points.reshape(k + 1, -1).T @ sampled
+
+        error = np.sqrt(np.square(psfs - found).sum())
+        expected = np.sqrt(np.square(modes.singular_values[k:]).sum())
+        assert error == pytest.approx(expected, rel=2e-4)  # the modes are from PSFs in single precision
+        np.testing.assert_allclose(modes.combinations[1:].sum(axis=1), 0.0, atol=1e-14)
+        assert modes.combinations[0].sum() == pytest.approx(1.0, rel=1e-14)
+
+
+@pytest.mark.slow(keep=1)
+@pytest.mark.parametrize("tolerance", [0.1, 0.03, 0.01])
+def test_field_error_bounds_displaced_light(tolerance):
+    n = 96
+    lens = replace(LENS, field_tolerance=tolerance, padding_cells=60)
+    blank = scene_of(np.zeros((n, n)))
+    grid, error = lens.grid(blank), lens.field_error(blank)
+    assert error <= tolerance
+    assert replace(lens, field_tolerance=0.5 * tolerance).field_error(blank) < error
+    rng = np.random.default_rng(4)
+    displaced = []
+    for row, column in rng.integers(0, n, (50, 2)):
+        image = np.zeros((n, n))
+        image[row, column] = 1.0
+        x_um, y_um = grid.x_um[column], grid.y_um[row]
+
+        def pupil(x, y, wave_nm, at=(float(x_um), float(y_um))):
+            return np.exp(2j * np.pi * SEIDEL.wavefront_um(x, y, wave_nm, at) / (1e-3 * wave_nm))
+
+        found = lens.power_map(scene_of(image)).data[0]
+        expected = replace(lens, seidel=None, pupil=pupil).power_map(scene_of(image)).data[0]
+        displaced.append(0.5 * np.abs(found - expected).sum() / expected.sum())
+
+    assert max(displaced) <= error
+    assert max(displaced) > 0.1 * error
+
+
+def test_fewer_modes_suffice_for_larger_tolerances():
+    scene = noise()
+    numbers = [
+        find_modes(
+            LENS.aperture(scene), LENS.grid(scene), scene.wavelength_nm, tolerance=t, n_modes=None, n_threads=1
+        ).n_modes
+        for t in (0.5, 0.1, 0.02, 0.01)
+    ]
+
+    assert numbers == sorted(numbers)
+    assert numbers[0] < numbers[-1] < 30
+
+
+def test_unreachable_tolerance_causes_warning():
+    strong = replace(LENS, seidel=Seidel(coma_um=1.0, astigmatism_um=2.0, field_radius_um=10.0))
+    with pytest.warns(
+        SamplingWarning, match=r"modes displace 0\.\d+ of the light of a point, more than field_tolerance"
+    ):
+        strong.power_map(noise(n=16))
+
+
+def test_equal_psfs_need_no_modes():
+    nearly = replace(LENS, seidel=Seidel(spherical_um=0.1, coma_um=1.0, field_radius_um=1e7))
+    scene = noise()
+    fixed = replace(LENS, seidel=Seidel(spherical_um=0.1)).power_map(scene).data
+
+    assert nearly.field_error(scene) < 1e-4
+    np.testing.assert_allclose(nearly.power_map(scene).data, fixed, rtol=1e-6)
+
+
+def test_turned_scene_has_turned_map():
+    # The aberrations have the symmetry; the picture is turned by 180 degrees.
+    image = np.random.default_rng(3).random((40, 40))
+    lens = replace(LENS, field_modes=10)
+
+    turned = lens.power_map(scene_of(image[::-1, ::-1])).data[:, ::-1, ::-1]
+    np.testing.assert_allclose(turned, lens.power_map(scene_of(image)).data, rtol=1e-5)
+
+
+def test_tiles_equal_captures_with_varying_psfs():
+    scene = noise(64, n_basis=3, waves_nm=WAVES_NM)
+    layout = fs.layout.grid(n_x=20, n_y=20, pitch_um=1.2)
+    camera = fs.Camera(optics=LENS, sensor=fs.Sensor(layout))
+    options = {"exposure_s": 0.01, "seed": 3}
+    whole, parts = (camera.capture(scene, **options), fs.tiles.capture_tiles(camera, scene, **options, tile_sites=150))
+
+    np.testing.assert_array_equal(np.concatenate([tile.code for tile in parts]), whole.code)
+
+
+def test_used_lens_with_modes_is_pickled():
+    scene, lens = noise(), replace(LENS, field_modes=4)
+    expected = lens.power_map(scene).data
+
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(lens)).power_map(scene).data, expected)
+    np.testing.assert_allclose(lens.power_map(scene, n_threads=2).data, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"field_tolerance": 0.0}, "'field_tolerance' must be > 0"),
+        ({"field_modes": 81}, "'field_modes' must be <= 80"),
+        ({"field_modes": "all"}, "'field_modes' must be"),
+        ({"field_patches": 3, "padding": "periodic"}, "'padding' must not be 'periodic' with 'field_patches'"),
+    ],
+)
+def test_wrong_field_settings_are_rejected(changes, match):
+    with pytest.raises(ParameterError, match=match):
+        replace(LENS, **changes)
