@@ -145,7 +145,8 @@ def _singular_vectors(deviations: NDArray[Any]) -> tuple[Floats, Floats]:
     """
     Return the singular values and vectors of deviations from a mean.
 
-    (n_point - 1,) and (n_point - 1, n_point). There are far fewer points than samples: they are the eigenvectors of the products, orthogonal to the mean.
+    (n_point - 1,) and (n_point - 1, n_point). There are far fewer points than samples: they are the eigenvectors of the
+    products, orthogonal to the mean.
     """
     n_points, n_samples = deviations.shape
     products = np.zeros((n_points, n_points))
@@ -199,7 +200,8 @@ def sampled_psfs(
     """
     Return samples of the PSFs at points of the field, at multiples of λN/2.
 
-    (n_point, n_wavelength, n_sample): at the shortest, a middle and the longest wavelength, in a square that contains the geometric blur of all points.
+    (n_point, n_wavelength, n_sample): at the shortest, a middle and the longest wavelength, in a square that contains the
+    geometric blur of all points.
     """
     points = [(float(x_um), float(y_um)) for x_um, y_um in points_um]
     waves_nm = np.unique(wavelength_nm)

@@ -102,9 +102,10 @@ class PlaneTables:
     """
     Complex OTF tables over (f_y, f_x) of an arbitrary aperture.
 
-    They are for one point of the field, or for modes of several. A mode is a sum of the PSFs at the points: its weights are a row of ``combinations`` (n_mode, n_point). The weights of a sum
-    are those of all wavelengths in the first mode, in the second, and so on. The sampling of the aperture is adapted to each
-    wavelength, so that all OTFs have the same frequency step and can be added.
+    They are for one point of the field, or for modes of several. A mode is a sum of the PSFs at the points: its weights are
+    a row of ``combinations`` (n_mode, n_point). The weights of a sum are those of all wavelengths in the first mode, in the
+    second, and so on. The sampling of the aperture is adapted to each wavelength, so that all OTFs have the same frequency
+    step and can be added.
     """
 
     def __init__(
