@@ -28,6 +28,7 @@ import shapely
 from angular import bench_angular
 from dense import bench_dense
 from exploring import bench_exploring
+from field_modes import bench_field_modes
 from gradients import bench_gradients
 from kernels import bench_first_capture, bench_kernels
 from learning import bench_learning, bench_stored
@@ -447,6 +448,8 @@ def main() -> int:
         bench_dense(report, 512 if is_quick else 2048)
     with console.status("bench angular"):
         bench_angular(report, shape, 512 if is_quick else 2048)
+    with console.status("bench field modes"):
+        bench_field_modes(report, 512 if is_quick else 2048)
     with console.status("bench kernels"):
         bench_kernels(report, 512 if is_quick else 2048)
     with console.status("bench sensor"):

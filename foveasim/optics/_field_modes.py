@@ -41,19 +41,13 @@ SAMPLES_TOGETHER = 1 << 16
 @dataclass(frozen=True, eq=False)
 class FieldWeight:
     """
-    Weight of a mode at the pixels of a picture, ``along_y @ at_points @ along_x.T``.
+    Weight of a mode at the pixels of a picture, ``along_y @ profiles``.
 
-    ``along_y`` (n_y, n), ``along_x`` (n_x, n): interpolation from the points of the field. ``at_points`` (n, n).
+    ``along_y`` (n_y, n): interpolation from the rows of points of the field. ``profiles`` (n, n_x): weights along these rows.
     """
 
     along_y: Floats
-    at_points: Floats
-    along_x: Floats
-
-    def rows(self, first: int, last: int) -> Floats:
-        """Return the weights of some rows, (last - first, n_x)."""
-        weights: Floats = (self.along_y[first:last] @ self.at_points) @ self.along_x.T
-        return weights
+    profiles: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +75,8 @@ class FieldModes:
     def weights(self, shape: tuple[int, int]) -> list[FieldWeight]:
         """Return the weights of all modes but the mean at the pixels of a picture."""
         along_y, along_x = (interpolation(self.at_points.shape[1], (np.arange(n) + 0.5) / n) for n in shape)
-        return [FieldWeight(along_y, each, along_x) for each in self.at_points[1:]]
+        # Not as matrix products: the threads of BLAS would compete with ours.
+        return [FieldWeight(along_y, np.einsum("ij,xj->ix", each, along_x)) for each in self.at_points[1:]]
 
 
 def interpolation(n_points: int, at: Floats) -> Floats:

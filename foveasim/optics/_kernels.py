@@ -60,6 +60,31 @@ def apply_falloff(rows, x2, y2, power, source_column, n_before, out):
             line[column] = inner[source_column[column]] if source_column[column] >= 0 else 0.0
 
 
+@njit(
+    [
+        types.void(
+            types.Array(cell, 2, "C", readonly=True),
+            types.Array(real, 2, "C", readonly=True),
+            types.Array(real, 2, "C", readonly=True),
+            real[:, ::1],
+        )
+        for cell in (types.float32, types.float64)
+        for real in (types.float32, types.float64)
+    ],
+)
+def weigh_rows(rows, along_y, profiles, out):
+    """Write rows of a picture times ``along_y @ profiles``, (n_row, n) and (n, n_x)."""
+    for row in range(out.shape[0]):
+        line, source = out[row], rows[row]
+        line[:] = along_y[row, 0] * profiles[0]
+        for i in range(1, profiles.shape[0]):
+            weight, profile = along_y[row, i], profiles[i]
+            for ix in range(line.size):
+                line[ix] += weight * profile[ix]
+        for ix in range(line.size):
+            line[ix] *= source[ix]
+
+
 _PAIRS = ((types.complex64, types.float32), (types.complex128, types.float64))
 
 

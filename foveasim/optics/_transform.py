@@ -223,12 +223,16 @@ class Transform:
         """Write the spectrum of a padded picture with relative illumination and weights."""
         (n_y, _), (top, left) = self._picture_shape, self._n_before
         x2, y2 = x2.astype(self._real), y2.astype(self._real)
+        if weight is not None:
+            along_y, profiles = weight.along_y.astype(self._real), weight.profiles.astype(self._real)
 
         def transform_rows(first: int, last: int) -> None:
             padded = np.empty((last - first, self._columns.size), self._real)
             rows = np.ascontiguousarray(image[first:last])
             if weight is not None:
-                rows = rows * weight.rows(first, last).astype(self._real)
+                weighted = np.empty((last - first, rows.shape[1]), self._real)
+                self._kernels.weigh_rows(rows, along_y[first:last], profiles, weighted)
+                rows = weighted
             self._kernels.apply_falloff(rows, x2, y2[first:last], falloff_power, self._columns, left, padded)
             self._kernels.store_rows(scipy.fft.rfft(padded, axis=1, overwrite_x=True), top + first, out)
 

@@ -32,10 +32,11 @@ MAX_CACHED_APERTURES = 4
 MAX_TABLE_SIZE = 1 << 24
 #: Memory limit of the tables cached per lens, in complex numbers (512 MiB in single precision).
 MAX_CACHE_SIZE = 1 << 26
-#: Memory limit of the cached factors on spectra, in numbers (128 MiB in single precision); fits a colour video at 1080p.
-MAX_FACTOR_SIZE = 1 << 25
+#: Memory limit of the cached factors on spectra, in numbers (512 MiB in single precision): those of 27 modes and
+#: 2048 x 2048 cells.
+MAX_FACTOR_SIZE = 1 << 27
 #: Largest number of sums with recorded requests; the oldest entry is removed first.
-MAX_RECORDED_SUMS = 64
+MAX_RECORDED_SUMS = 512
 
 
 def circular_otf(s: ArrayLike) -> Floats:
