@@ -76,7 +76,7 @@ class Imaging(nn.Module):
 
     Notes
     -----
-    Where aberrations vary over the field, isoplanatic patches replace modes: ``optics.field_patches``, by default 5.
+    Where variable aberrations vary over the field, isoplanatic patches replace modes: ``optics.field_patches``, by default 5.
     Padding, and the sampling of the aperture, are those of the initial lens: start with aberrations of the size that you
     expect, or set ``padding_cells``. Variations of a lens whose initial OTF is that of the clear circle use the sampled
     aperture, whose OTF is accurate to 7e-4.
@@ -94,15 +94,17 @@ class Imaging(nn.Module):
         self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
         initial = optics.resolve_oversample(scene)
         self._optics = replace(initial, precision="double")
-        if initial.is_varying and initial.field_patches is None:
+        if self.wrt and initial.is_varying and initial.field_patches is None:
             self._optics = replace(self._optics, field_patches=PATCHES)
         if self.wrt and self._optics.zernike is None and self._optics.seidel is None and not self._optics.pupil:
             # A sampled aperture without aberrations.
             self._optics = replace(self._optics, zernike=Zernike(coefficients={4: 0.0}))
         self._scene = scene
         self._aperture: Aperture = self._optics.aperture(scene)
-        n_waves = scene.wavelength_nm.size
-        self._imaging, self._tables_at = self._optics.imaging(scene, np.eye(n_waves))
+        self._imaging, self._tables_at = self._optics.imaging(scene, np.eye(scene.wavelength_nm.size))
+        # Weights of the modes over the field, the mean first.
+        weights = [np.ones(scene.basis.shape[1:]), *(each.at_pixels() for each in self._imaging.field_weights)]
+        self.register_buffer("_field_weights", constant(np.stack(weights)))
         self.register_buffer("_irradiance", constant(self._imaging.irradiance_w_m2))
         self.grid: Grid = self._optics.image_grids(scene)[0][0]
         self._n_patches = self._optics.n_patches
@@ -207,7 +209,11 @@ class Imaging(nn.Module):
         if not isinstance(basis, Tensor) or basis.ndim < 3:
             check_tensor("basis", basis, shape)
         flat = check_tensor("basis", basis.reshape(-1, *basis.shape[-3:]), (None, *shape), ", as the scene").double()
-        per_basis = weights[:, None, :] * self._irradiance
+        # Each pair of an image and a mode is an image, and each pair of a wavelength and a mode a wavelength.
+        n_modes = self._field_weights.shape[0]
+        if n_modes > 1:
+            flat = (flat[:, :, None] * self._field_weights).flatten(1, 2)
+        per_basis = weights.tile(1, n_modes)[:, None, :] * self._irradiance
         k, (n_y, n_x) = self._imaging.oversample, shape[1:]
         maps = torch.zeros(flat.shape[0], weights.shape[0], k * n_y, k * n_x, dtype=torch.float64)
         for number, (field_um, rows, columns) in enumerate(self._extents()):
@@ -274,7 +280,7 @@ class Imaging(nn.Module):
 
         (n_wavelength, k n_y, k n_x // 2 + 1) and (n_wavelength,).
         """
-        n_waves = self._scene.wavelength_nm.size
+        n_waves = self._irradiance.shape[1]
         if self.wrt:
             tables, transmittance, per_step = self._otf_tables(field_um)
             return self._sample_tables(tables, per_step, n_y, n_x), transmittance

@@ -49,6 +49,10 @@ class FieldWeight:
     along_y: Floats
     profiles: Floats
 
+    def at_pixels(self) -> Floats:
+        """Return the weights of all pixels, (n_y, n_x)."""
+        return np.einsum("yi,ix->yx", self.along_y, self.profiles)
+
 
 @dataclass(frozen=True, eq=False)
 class FieldModes:

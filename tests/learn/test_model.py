@@ -62,6 +62,8 @@ def test_maps_agree_with_simulator(padding, oversample):
         ({"zernike": ZERNIKE, "oversample": 2, "source_pixel": "square"}, ("zernike", "defocus")),
         ({"seidel": SEIDEL, "field_patches": 3}, ("seidel",)),
         ({"seidel": SEIDEL, "field_patches": 3, "oversample": 2}, ()),
+        ({"seidel": SEIDEL}, ()),
+        ({"seidel": SEIDEL, "oversample": 2, "padding": "periodic"}, ()),
         ({"pupil": PUPIL, "oversample": 2}, ("pupil",)),
         ({"pupil": PUPIL, "zernike": ZERNIKE}, ("pupil", "zernike")),
     ],
@@ -89,6 +91,7 @@ def test_variable_lenses_agree_with_simulator(changes, wrt):
         ({"zernike": ZERNIKE}, ("zernike", "defocus")),
         ({"zernike": ZERNIKE, "oversample": 2}, ("zernike",)),
         ({"seidel": SEIDEL, "field_patches": 2}, ("seidel",)),
+        ({"seidel": SEIDEL, "field_modes": 3}, ()),
         ({"pupil": PUPIL}, ("pupil",)),
     ],
 )
