@@ -131,16 +131,17 @@ class Aperture:
 
     def _sample_pupil(self, wavelength_nm: float, n: int) -> NDArray[Any]:
         """Sample the amplitudes on an (n, n) grid over the square around the aperture."""
-        key = "shape", 0.0 if self.is_achromatic else wavelength_nm, n
-        if self._cache.get("shape of", None) != key:
+        key = 0.0 if self.is_achromatic else wavelength_nm, n
+        known = self._cache.get("shape")  # with its key in one object, since threads replace it
+        if known is None or known[0] != key:
             at: Floats = np.asarray((np.arange(n) + 0.5) * (2.0 / n) - 1.0, np.float64)
             x, y = at[np.newaxis, :], at[:, np.newaxis]
             disc = x * x + y * y <= 1.0
             shape: NDArray[Any] = disc.astype(np.float64)
             for i, pupil in enumerate(self.pupils):
                 shape = shape * self._evaluate_pupil(i, pupil, x, y, wavelength_nm, disc)
-            self._cache["shape of"], self._cache["shape"] = key, shape
-        return np.asarray(self._cache["shape"])
+            known = self._cache["shape"] = key, shape
+        return np.asarray(known[1])
 
     def _evaluate_pupil(
         self, i: int, pupil: Pupil, x: Floats, y: Floats, wavelength_nm: float, disc: Bools
@@ -265,14 +266,14 @@ class Aperture:
 
     def _mean_pupil(self, wavelength_nm: float, n_across: float) -> NDArray[Any]:
         """Return the amplitudes of the pupil, averaged over the squares around the samples."""
-        key = "mean", 0.0 if self.is_achromatic else wavelength_nm, n_across
-        if self._cache.get("mean of", None) != key:
+        key = 0.0 if self.is_achromatic else wavelength_nm, n_across
+        known = self._cache.get("mean")
+        if known is None or known[0] != key:
             n = math.ceil(n_across)
             fine = self._sample_pupil(wavelength_nm, max(PUPIL_POINTS, n))
             mean = overlaps(n, 2.0 / n_across, fine.shape[0], 2.0 / fine.shape[0])
-            self._cache["mean"] = (mean @ (mean @ fine).T).T
-            self._cache["mean of"] = key
-        return np.asarray(self._cache["mean"])
+            known = self._cache["mean"] = key, (mean @ (mean @ fine).T).T
+        return np.asarray(known[1])
 
     def sampled_psf(
         self, wavelength_nm: float, n_across: int, radius: int, field_um: tuple[float, float], real: Any

@@ -188,6 +188,16 @@ def test_used_lens_with_modes_is_pickled():
     np.testing.assert_allclose(lens.power_map(scene, n_threads=2).data, expected, rtol=1e-12)
 
 
+@pytest.mark.slow
+def test_threads_share_pupils_of_several_wavelengths():
+    scene = noise(waves_nm=np.array([450.0, 500.0, 560.0, 640.0]))
+    expected = replace(LENS, field_modes=4).power_map(scene, n_threads=1).data
+
+    for _ in range(3):
+        found = replace(LENS, field_modes=4).power_map(scene, n_threads=4).data
+        np.testing.assert_allclose(found, expected, atol=1e-12 * expected.max())
+
+
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
