@@ -41,17 +41,28 @@ SAMPLES_TOGETHER = 1 << 16
 @dataclass(frozen=True, eq=False)
 class FieldWeight:
     """
-    Weight of a mode at the pixels of a picture, ``along_y @ profiles``.
+    Function of the field at the pixels of a picture, ``along_y @ profiles``.
 
-    ``along_y`` (n_y, n): interpolation from the rows of points of the field. ``profiles`` (n, n_x): weights along these rows.
+    ``along_y`` (n_y, n): functions along y, of which at most four in succession differ from 0 in each row. ``profiles``
+    (n, n_x): their factors along x.
     """
 
     along_y: Floats
     profiles: Floats
 
     def at_pixels(self) -> Floats:
-        """Return the weights of all pixels, (n_y, n_x)."""
+        """Return the values at all pixels, (n_y, n_x)."""
         return np.einsum("yi,ix->yx", self.along_y, self.profiles)
+
+
+def field_weights(at_points: Floats, shape: tuple[int, int]) -> list[FieldWeight]:
+    """Return splines through values (m, n, n) at points from edge to edge, at the pixels of a picture."""
+    # Local functions along y: the spline through unit values at one point does not vanish between the others.
+    along_y, coefficients = splines(at_points.shape[1], (np.arange(shape[0]) + 0.5) / shape[0])
+    along_x = interpolation(at_points.shape[2], (np.arange(shape[1]) + 0.5) / shape[1])
+    # Not as matrix products: the threads of BLAS would compete with ours.
+    of_splines = np.einsum("ki,mij->mkj", coefficients, at_points)
+    return [FieldWeight(along_y, np.einsum("kj,xj->kx", each, along_x)) for each in of_splines]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,17 +89,25 @@ class FieldModes:
 
     def weights(self, shape: tuple[int, int]) -> list[FieldWeight]:
         """Return the weights of all modes but the mean at the pixels of a picture."""
-        along_y, along_x = (interpolation(self.at_points.shape[1], (np.arange(n) + 0.5) / n) for n in shape)
-        # Not as matrix products: the threads of BLAS would compete with ours.
-        return [FieldWeight(along_y, np.einsum("ij,xj->ix", each, along_x)) for each in self.at_points[1:]]
+        return field_weights(self.at_points[1:], shape)
+
+
+def splines(n_points: int, at: Floats) -> tuple[Floats, Floats]:
+    """
+    Return cubic B-splines at positions from 0 to 1, (n, n_spline), and their coefficients.
+
+    The coefficients (n_spline, n_points) are those of the splines through unit values at equidistant points.
+    """
+    from scipy.interpolate import BSpline, make_interp_spline
+
+    spline = make_interp_spline(np.linspace(0.0, 1.0, n_points), np.eye(n_points), k=min(3, n_points - 1))
+    return BSpline.design_matrix(at, spline.t, spline.k).toarray(), np.asarray(spline.c)
 
 
 def interpolation(n_points: int, at: Floats) -> Floats:
     """Return the matrix (n, n_points) of cubic splines through equidistant points from 0 to 1."""
-    from scipy.interpolate import make_interp_spline
-
-    spline = make_interp_spline(np.linspace(0.0, 1.0, n_points), np.eye(n_points), k=min(3, n_points - 1))
-    return np.ascontiguousarray(spline(at))
+    along, coefficients = splines(n_points, at)
+    return np.einsum("nk,kp->np", along, coefficients)
 
 
 def field_points_um(grid: Grid, n_points: int) -> Floats:

@@ -40,6 +40,8 @@ MapRows = Callable[[int, int], NDArray[Any]]
 
 #: Callable of (weights of a sum, transform, tables) that returns the transfer function of a sum, cached or not.
 FactorLookup = Callable[[Floats, Transform, Tables], Factor]
+#: Function of (first, last) that processes columns of spectra.
+Columns = Callable[[int, int], None]
 #: Callable of weights of a sum that returns its transfer function.
 FactorOf = Callable[[Floats], Factor]
 #: Comparison of the PSFs of neighbouring patches: points along either axis, and margin in λN beyond the geometric blur.
@@ -170,45 +172,49 @@ class Imaging:
         """Yield maps with one PSF, or with modes of the field; their rows are computed on demand."""
         transform = self.transform(*self.sources(), self.grid.shape)
 
-        def write_spectrum(b: int, out: NDArray[Any]) -> None:
+        def write_spectrum(b: int, out: NDArray[Any], after: Columns | None) -> None:
             b, mode = divmod(b, 1 + len(self.field_weights))
-            weight = self.field_weights[mode - 1] if mode else None
-            transform.forward(
-                in_memory(self.basis[b]), self.tangent2_x, self.tangent2_y, self.falloff_power, out, weight
-            )
+            weights = self.field_weights[mode - 1 : mode] if mode else ()
+            image = in_memory(self.basis[b])
+            transform.forward(image, self.tangent2_x, self.tangent2_y, self.falloff_power, out, weights, after)
 
         return self._maps(transform, write_spectrum, lambda weight: self.cached_factor(weight, transform, table_of))
 
     def _maps(
         self,
         transform: Transform,
-        write_spectrum: Callable[[int, NDArray[Any]], None],
+        write_spectrum: Callable[[int, NDArray[Any], Columns | None], None],
         factor_of: FactorOf,
     ) -> Iterator[MapRows]:
         stored: dict[Group, NDArray[Any]] = {}
 
-        def add(spectra: NDArray[Any], step: Step, sums: NDArray[Any], *, is_first: bool, is_last: bool) -> None:
+        def filtering(spectra: NDArray[Any], step: Step, sums: NDArray[Any], **position: bool) -> Columns:
             factors = [factor_of(weight) for weight in step.weights]
-            transform.add_filtered(spectra, factors, step.coefficients, sums, is_first=is_first, is_last=is_last)
+            return transform.filtering(spectra, factors, step.coefficients, sums, **position)
 
         def sum_together(group: Group) -> NDArray[Any]:
             spectra, sums = transform.spectra(1), transform.sums(group.steps[0].outputs.size)
             for step in group.steps:
-                write_spectrum(int(step.basis[0]), spectra[0])
-                add(spectra, step, sums, is_first=step is group.steps[0], is_last=step is group.steps[-1])
+                position = {"is_first": step is group.steps[0], "is_last": step is group.steps[-1]}
+                add = filtering(spectra, step, sums, **position)
+                if transform.is_filtered_by_blocks:
+                    write_spectrum(int(step.basis[0]), spectra[0], add)
+                else:
+                    write_spectrum(int(step.basis[0]), spectra[0], None)
+                    transform.for_each_block_of_columns(add)
             return sums
 
         def sum_step(group: Group, step: Step) -> NDArray[Any]:
             if step is group.steps[0]:
                 stored[group] = transform.spectra(group.basis.size)
                 for spectrum, b in zip(stored[group], group.basis, strict=True):
-                    write_spectrum(int(b), spectrum)
+                    write_spectrum(int(b), spectrum, None)
             is_last = step is group.steps[-1]
             spectra = stored.pop(group) if is_last else stored[group]
             # The last maps replace the spectra.
             is_replaced = is_last and spectra.shape[1:] == transform.spectrum_shape
             sums = spectra[: step.outputs.size] if is_replaced else transform.sums(step.outputs.size)
-            add(spectra, step, sums, is_first=True, is_last=True)
+            transform.for_each_block_of_columns(filtering(spectra, step, sums, is_first=True, is_last=True))
             return sums
 
         starting = {int(step.outputs[0]): (group, step) for group in self.groups for step in group.steps}
@@ -261,10 +267,10 @@ class Imaging:
         on_axis = np.zeros(shape[1]), np.zeros(shape[0])
         y, x = (range(int(sources.min()), int(sources.max()) + 1) for sources in (rows.sources, columns.sources))
 
-        def write_spectrum(b: int, out: NDArray[Any]) -> None:
+        def write_spectrum(b: int, out: NDArray[Any], after: Columns | None) -> None:
             box = self.basis[b, y.start : y.stop, x.start : x.stop]
             inner[:] = in_memory(box)[np.ix_(rows.sources - y.start, columns.sources - x.start)] * window
-            transform.forward(picture, *on_axis, self.falloff_power, out)
+            transform.forward(picture, *on_axis, self.falloff_power, out, (), after)
 
         return self._maps(transform, write_spectrum, lambda weight: transform.factor(*table_of(weight)))
 

@@ -14,6 +14,33 @@ from foveasim._core.jit import njit
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 #: Columns per pass of a transposition: a cache line of complex64.
 COLUMNS_TOGETHER = 8
+#: Terms of a cubic spline at a point.
+TERMS_TOGETHER = 4
+
+
+@njit()
+def _weigh(line, factors, profiles):
+    """
+    Multiply a row of a picture by ``factors @ profiles``, (n,) and (n, n_x).
+
+    The nonzero factors are within :data:`TERMS_TOGETHER` in succession.
+    """
+    n = factors.size
+    first = 0
+    while first < n - 1 and factors[first] == 0.0:
+        first += 1
+    first = max(0, min(first, n - TERMS_TOGETHER))
+    if n >= TERMS_TOGETHER:
+        a, b, c, d = factors[first], factors[first + 1], factors[first + 2], factors[first + 3]
+        p, q, r, s = profiles[first], profiles[first + 1], profiles[first + 2], profiles[first + 3]
+        for ix in range(line.size):
+            line[ix] *= (a * p[ix] + b * q[ix]) + (c * r[ix] + d * s[ix])
+    else:
+        for ix in range(line.size):
+            total = factors[0] * profiles[0, ix]
+            for i in range(1, n):
+                total += factors[i] * profiles[i, ix]
+            line[ix] *= total
 
 
 @njit(
@@ -23,6 +50,8 @@ COLUMNS_TOGETHER = 8
             types.Array(real, 1, "C", readonly=True),
             types.Array(real, 1, "C", readonly=True),
             types.int64,
+            types.Array(real, 3, "C", readonly=True),
+            types.Array(real, 3, "C", readonly=True),
             types.Array(types.int64, 1, "C", readonly=True),
             types.int64,
             real[:, ::1],
@@ -31,11 +60,12 @@ COLUMNS_TOGETHER = 8
         for real in (types.float32, types.float64)
     ],
 )
-def apply_falloff(rows, x2, y2, power, source_column, n_before, out):
+def apply_falloff(rows, x2, y2, power, along_y, profiles, source_column, n_before, out):
     """
-    Write rows of a picture times ``cos(theta) ** power``, padded on both sides.
+    Write rows of a picture times ``cos(theta) ** power`` and further functions, padded on both sides.
 
-    ``x2`` and ``y2`` are (x0/H)² of the picture columns and (y0/H)² of the rows, so that ``cos² = 1 / (1 + x2 + y2)``.
+    ``x2`` and ``y2`` are (x0/H)² of the picture columns and (y0/H)² of the rows, so that ``cos² = 1 / (1 + x2 + y2)``. The
+    functions are ``along_y[k] @ profiles[k]``, (n_function, n_row, n) and (n_function, n, n_x).
     ``source_column`` contains the picture column of each column of ``out``, -1 for zero. Picture column 0 is written to
     column ``n_before``.
     """
@@ -54,35 +84,12 @@ def apply_falloff(rows, x2, y2, power, source_column, n_before, out):
             for ix in range(n_x):
                 cos2 = one / (base + x2[ix])
                 inner[ix] = source[ix] * (cos2 * np.sqrt(cos2))
+        for k in range(along_y.shape[0]):
+            _weigh(inner, along_y[k, row], profiles[k])
         for column in range(n_before):
             line[column] = inner[source_column[column]] if source_column[column] >= 0 else 0.0
         for column in range(n_before + n_x, line.size):
             line[column] = inner[source_column[column]] if source_column[column] >= 0 else 0.0
-
-
-@njit(
-    [
-        types.void(
-            types.Array(cell, 2, "C", readonly=True),
-            types.Array(real, 2, "C", readonly=True),
-            types.Array(real, 2, "C", readonly=True),
-            real[:, ::1],
-        )
-        for cell in (types.float32, types.float64)
-        for real in (types.float32, types.float64)
-    ],
-)
-def weigh_rows(rows, along_y, profiles, out):
-    """Write rows of a picture times ``along_y @ profiles``, (n_row, n) and (n, n_x)."""
-    for row in range(out.shape[0]):
-        line, source = out[row], rows[row]
-        line[:] = along_y[row, 0] * profiles[0]
-        for i in range(1, profiles.shape[0]):
-            weight, profile = along_y[row, i], profiles[i]
-            for ix in range(line.size):
-                line[ix] += weight * profile[ix]
-        for ix in range(line.size):
-            line[ix] *= source[ix]
 
 
 _PAIRS = ((types.complex64, types.float32), (types.complex128, types.float64))
@@ -256,6 +263,27 @@ def plane_factor(table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, first, o
                         h[iy] += _interpolate_plane(table, v, u) * (gain_x[kx, ix] * gain_y[ky, iy])
 
 
+@njit()
+def _add_product(line, factor, size, is_first, total):
+    """
+    Add a column of a spectrum times ``size * factor``.
+
+    Of an even factor, only the rows of frequencies >= 0 are stored.
+    """
+    n_half = factor.size
+    n_mirrored = line.size - n_half
+    if is_first:
+        for iy in range(n_half):
+            total[iy] = line[iy] * (size * factor[iy])
+        for iy in range(n_mirrored):
+            total[n_half + iy] = line[n_half + iy] * (size * factor[n_mirrored - iy])
+    else:
+        for iy in range(n_half):
+            total[iy] += line[iy] * (size * factor[iy])
+        for iy in range(n_mirrored):
+            total[n_half + iy] += line[n_half + iy] * (size * factor[n_mirrored - iy])
+
+
 @njit(
     [
         types.void(_in(c, 3), _in(h, 3), _in(r, 3), types.int64, types.boolean, c[:, :, ::1])
@@ -272,40 +300,29 @@ def filter_and_sum(lines, factors, coefficients, first, is_added, out):
     the rows of frequencies >= 0. ``out`` may be ``lines``, if both are one complete spectrum.
     """
     n_outputs, n_basis, n_factors = coefficients.shape
-    n_rows, n_half = lines.shape[2], factors.shape[2]
-    n_mirrored = n_rows - n_half
-    h = np.empty(n_half, factors.dtype)
+    one = coefficients.dtype.type(1.0)
+    h = np.empty(factors.shape[2], factors.dtype)
     for column in range(lines.shape[1]):
         for c in range(n_outputs):
             is_first = not is_added
             total = out[c, first + column]
             for b in range(n_basis):
-                line = lines[b, column]
-                is_needed = False
+                n_needed, only = 0, 0
                 for r in range(n_factors):
-                    size = coefficients[c, b, r]
-                    if size == 0.0:
-                        continue
-                    factor = factors[r, column]
-                    if is_needed:
-                        for iy in range(n_half):
-                            h[iy] += size * factor[iy]
-                    else:
-                        for iy in range(n_half):
-                            h[iy] = size * factor[iy]
-                        is_needed = True
-                if not is_needed:
+                    if coefficients[c, b, r] != 0.0:
+                        n_needed, only = n_needed + 1, r
+                if n_needed == 0:
                     continue
-                if is_first:
-                    for iy in range(n_half):
-                        total[iy] = line[iy] * h[iy]
-                    for iy in range(n_mirrored):
-                        total[n_half + iy] = line[n_half + iy] * h[n_mirrored - iy]
+                if n_needed == 1:
+                    _add_product(lines[b, column], factors[only, column], coefficients[c, b, only], is_first, total)
                 else:
-                    for iy in range(n_half):
-                        total[iy] += line[iy] * h[iy]
-                    for iy in range(n_mirrored):
-                        total[n_half + iy] += line[n_half + iy] * h[n_mirrored - iy]
+                    h[:] = 0.0
+                    for r in range(n_factors):
+                        size, factor = coefficients[c, b, r], factors[r, column]
+                        if size != 0.0:
+                            for iy in range(h.size):
+                                h[iy] += size * factor[iy]
+                    _add_product(lines[b, column], h, one, is_first, total)
                 is_first = False
             if is_first:
                 total[:] = 0.0

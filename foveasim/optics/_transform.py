@@ -218,28 +218,32 @@ class Transform:
         y2: Floats,
         falloff_power: int,
         out: NDArray[Any],
-        weight: FieldWeight | None = None,
+        weights: Sequence[FieldWeight] = (),
+        after: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Write the spectrum of a padded picture with relative illumination and weights."""
+        """
+        Write the spectrum of a padded picture with relative illumination and weights.
+
+        ``after``: called with (first, last) of each block of columns while it is in the cache of a core.
+        """
         (n_y, _), (top, left) = self._picture_shape, self._n_before
         x2, y2 = x2.astype(self._real), y2.astype(self._real)
-        if weight is not None:
-            along_y, profiles = weight.along_y.astype(self._real), weight.profiles.astype(self._real)
+        along_y, profiles = _stacked(weights, self._picture_shape, self._real)
 
         def transform_rows(first: int, last: int) -> None:
             padded = np.empty((last - first, self._columns.size), self._real)
-            rows = np.ascontiguousarray(image[first:last])
-            if weight is not None:
-                weighted = np.empty((last - first, rows.shape[1]), self._real)
-                self._kernels.weigh_rows(rows, along_y[first:last], profiles, weighted)
-                rows = weighted
-            self._kernels.apply_falloff(rows, x2, y2[first:last], falloff_power, self._columns, left, padded)
+            rows, of_rows = np.ascontiguousarray(image[first:last]), np.ascontiguousarray(along_y[:, first:last])
+            self._kernels.apply_falloff(
+                rows, x2, y2[first:last], falloff_power, of_rows, profiles, self._columns, left, padded
+            )
             self._kernels.store_rows(scipy.fft.rfft(padded, axis=1, overwrite_x=True), top + first, out)
 
         def transform_columns(first: int, last: int) -> None:
             lines = out[first:last]
             self._kernels.pad_lines(self._rows, top, n_y, lines)
             _in_place(scipy.fft.fft, lines)
+            if after is not None:
+                after(first, last)
 
         self._for_each_block(transform_rows, n_y, ROWS_PER_BLOCK)
         self._for_each_block(transform_columns, out.shape[0], COLUMNS_PER_BLOCK)
@@ -275,7 +279,16 @@ class Transform:
             )
         )
 
-    def add_filtered(
+    @property
+    def is_filtered_by_blocks(self) -> bool:
+        """Whether columns of a sum depend on the same columns of spectra only."""
+        return self._oversample == 1
+
+    def for_each_block_of_columns(self, work: Callable[[int, int], None]) -> None:
+        """Call a function of (first, last) for all columns of a sum, in threads."""
+        self._for_each_block(work, self._n_columns, COLUMNS_PER_BLOCK)
+
+    def filtering(
         self,
         spectra: NDArray[Any],
         factors: Sequence[Factor],
@@ -284,14 +297,14 @@ class Transform:
         *,
         is_first: bool,
         is_last: bool,
-    ) -> None:
+    ) -> Callable[[int, int], None]:
         """
-        Add ``sum_br coefficients[c, b, r] * factors[r] * spectra[b]`` to ``out[c]``.
+        Return a function of (first, last) that computes columns of a sum.
 
-        ``spectra``: (n_basis, n_columns, n_rows). ``coefficients``: (n_output, n_basis, n_factor). ``out`` (n_output,
-        n_columns, n_rows): may be the first of the spectra, if there are at least as many as outputs and they have the same
-        shape. ``is_first``: whether the result is written to ``out`` instead of being added. ``is_last``: whether to transform
-        the sum back along y, for :meth:`inverse`.
+        It adds ``sum_br coefficients[c, b, r] * factors[r] * spectra[b]`` to ``out[c]``. ``spectra``: (n_basis, n_columns,
+        n_rows). ``coefficients``: (n_output, n_basis, n_factor). ``out`` (n_output, n_columns, n_rows): may be the first of
+        the spectra, if there are at least as many as outputs and they have the same shape. ``is_first``: whether the result is
+        written to ``out`` instead of being added. ``is_last``: whether to transform the sum back along y, for :meth:`inverse`.
         """
         coefficients = np.ascontiguousarray(coefficients, self._real)
 
@@ -304,7 +317,7 @@ class Transform:
                 for output in out:
                     _in_place(scipy.fft.ifft, output[first:last])
 
-        self._for_each_block(filter_columns, out.shape[1], COLUMNS_PER_BLOCK)
+        return filter_columns
 
     def _lines(self, spectra: NDArray[Any], first: int, last: int) -> NDArray[Any]:
         """Return columns of spectra over the frequencies of the map cells."""
@@ -343,6 +356,14 @@ class Transform:
 
         self._for_each_block(transform_rows, n_rows, ROWS_PER_BLOCK)
         return image
+
+
+def _stacked(weights: Sequence[FieldWeight], shape: tuple[int, int], real: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return functions of the field as (n_function, n_y, n) and (n_function, n, n_x)."""
+    n_y, n_x = shape
+    if not weights:
+        return np.empty((0, n_y, 1), real), np.empty((0, 1, n_x), real)
+    return np.stack([w.along_y for w in weights]).astype(real), np.stack([w.profiles for w in weights]).astype(real)
 
 
 def _interpolation(x: Floats, n_nodes: int) -> Floats:

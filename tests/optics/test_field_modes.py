@@ -35,10 +35,11 @@ def noise(n=48, n_basis=1, **options):
 def linear(monkeypatch):
     """Weights that are linear between the points, as those of patches."""
 
-    def interpolate(n_points, at):
-        return np.stack([np.interp(at, np.linspace(0, 1, n_points), row) for row in np.eye(n_points)], axis=1)
+    def splines(n_points, at):
+        unit = np.eye(n_points)
+        return np.stack([np.interp(at, np.linspace(0, 1, n_points), row) for row in unit], axis=1), unit
 
-    monkeypatch.setattr(_field_modes, "interpolation", interpolate)
+    monkeypatch.setattr(_field_modes, "splines", splines)
 
 
 # Cells of 0.4, 0.8 and 2.3 λN (aliases), finer cells, several basis images and wavelengths.
