@@ -56,7 +56,7 @@ class FieldWeight:
 
 
 def field_weights(at_points: Floats, shape: tuple[int, int]) -> list[FieldWeight]:
-    """Return splines through values (m, n, n) at points from edge to edge, at the pixels of a picture."""
+    """Return splines through values (m, n, n) at equidistant points of a picture."""
     # Local functions along y: the spline through unit values at one point does not vanish between the others.
     along_y, coefficients = splines(at_points.shape[1], (np.arange(shape[0]) + 0.5) / shape[0])
     along_x = interpolation(at_points.shape[2], (np.arange(shape[1]) + 0.5) / shape[1])
