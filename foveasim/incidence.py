@@ -36,6 +36,17 @@ MAX_RINGS = 64
 HEIGHT_ROUNDING = 1e-9
 
 
+def check_heights(image_height_um: Sequence[float], name: str, values: Sequence[float]) -> None:
+    """Check that the heights of a table ascend from 0, and that each has a value."""
+    heights_um = np.asarray(image_height_um)
+    if heights_um.size < 2 or heights_um[0] != 0.0 or not (np.diff(heights_um) > 0.0).all():
+        raise ParameterError(
+            "image_height_um", "must have at least two values that ascend from 0", list(image_height_um), "µm"
+        )
+    if len(values) != heights_um.size:
+        raise ParameterError(name, f"must have one value for each of the {heights_um.size} heights, got {len(values)}")
+
+
 @dataclass(frozen=True)
 class ChiefRayTable:
     """
@@ -72,14 +83,7 @@ class ChiefRayTable:
 
     def __post_init__(self) -> None:
         check_declared(self)
-        heights_um = np.asarray(self.image_height_um)
-        if heights_um.size < 2 or heights_um[0] != 0.0 or not (np.diff(heights_um) > 0.0).all():
-            raise ParameterError(
-                "image_height_um", "must have at least two values that ascend from 0", list(self.image_height_um), "µm"
-            )
-        if len(self.angle_deg) != heights_um.size:
-            rule = f"must have one angle for each of the {heights_um.size} heights, got {len(self.angle_deg)}"
-            raise ParameterError("angle_deg", rule)
+        check_heights(self.image_height_um, "angle_deg", self.angle_deg)
         if self.angle_deg[0] != 0.0:
             raise ParameterError("angle_deg", "must be 0 on the axis", self.angle_deg[0], "degrees")
 

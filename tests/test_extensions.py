@@ -15,7 +15,7 @@ from foveasim.errors import ParameterError
 from foveasim.explore import METRICS
 from foveasim.layout import DERIVED_LAYERS, EDITS, FORMATS, LAYOUTS, RULES, FileFormat, LayoutLayer, Rule, layout_family
 from foveasim.maps import MAP_FORMATS, Found
-from foveasim.optics import PUPILS, PupilEdges
+from foveasim.optics import PSF_FORMATS, PUPILS, PSFGrid, PupilEdges
 from foveasim.scene import CUBE_FORMATS, SCENES
 from foveasim.sensor import PIXEL_OPTICS, Footprints, PixelOptics
 from foveasim.sensor.effects import EFFECTS, AdditiveNoise, Effect, FixedFactor, FixedOffset
@@ -24,7 +24,7 @@ from foveasim.testing import check_all, check_extension, extensions
 
 REGISTRIES = (
     LAYOUTS, EDITS, RULES, FORMATS, DERIVED_LAYERS, MAP_FORMATS, CUBE_FORMATS, EFFECTS, PIXEL_OPTICS, CURVES, SCENES, PUPILS, LENSES,
-    METRICS,
+    METRICS, PSF_FORMATS,
 )  # fmt: skip
 NUMBERS = count()
 
@@ -118,6 +118,20 @@ def read_radiance(path, name, *, factor=1.0, top_row_first=True):
         band_width_nm=[10.0],
         unit="W m-2 sr-1 nm-1",
     )
+
+
+def psfs_of(values, **changes):
+    about = {"x_um": 0.0, "y_um": 0.0, "wavelength_nm": 550.0, "pitch_um": 2.0, **changes}
+    return PSFGrid.from_arrays(np.pad(values, 3), **about)
+
+
+def write_psf(path):
+    np.savetxt(path, [[1.0, 2.0], [3.0, 4.0]])
+    return psfs_of([[3.0, 4.0], [1.0, 2.0]])
+
+
+def read_psf(path, **changes):
+    return psfs_of(np.loadtxt(path).reshape(2, 2)[::-1], **changes)
 
 
 def text_format(read):
@@ -421,6 +435,12 @@ WRONG = [
     (CUBE_FORMATS, text_format(lambda p, n: read_radiance(p, n, top_row_first=False)), write_radiance, None,
      "returns another radiance"),
     (CUBE_FORMATS, text_format(read_radiance), {}, None, "has no example; register it with a function of a path"),
+    (PSF_FORMATS, text_format(lambda p: psfs_of(np.loadtxt(p))), write_psf, None, "returns other values; check that PSFs are up"),
+    (PSF_FORMATS, text_format(lambda p: read_psf(p, x_um=5.0)), write_psf, None, "returns other points of the field"),
+    (PSF_FORMATS, text_format(lambda p: read_psf(p, pitch_um=1.0)), write_psf, None, "returns other wavelengths or another dist"),
+    (PSF_FORMATS, text_format(lambda p: read_psf(p, samples="bins")), write_psf, None, "returns samples='bins'"),
+    (PSF_FORMATS, text_format(lambda p: read_psf(p, relative_illumination=[[0.5]])), write_psf, None, "returns another relative"),
+    (PSF_FORMATS, text_format(lambda _: psfs_of(np.ones((4, 4)))), write_psf, None, "returns PSFs of shape"),
     (EFFECTS, SameEachFrame, {}, None, "is temporal, but two frames are the same"),
     (EFFECTS, Irreproducible, {}, None, "must draw the same numbers for the same seed"),
     (EFFECTS, Underestimated, {}, None, r"has draws whose variance differs by 1\d.\d+% from that of predict"),
@@ -507,6 +527,7 @@ def test_every_kind_has_wrong_extensions():
         (FORMATS, text_format(read_corners), write_corners, None),
         (MAP_FORMATS, text_format(read_table), write_table, None),
         (CUBE_FORMATS, text_format(read_radiance), write_radiance, None),
+        (PSF_FORMATS, text_format(read_psf), write_psf, None),
         (EFFECTS, Ripple, {"sigma_v": 1e-3}, None),
         (EFFECTS, Pattern, {}, None),
         (PIXEL_OPTICS, Absorber, {"response": 0.4}, 0.4),

@@ -147,7 +147,7 @@ def test_lens_rejects_wrong_exit_pupils(parameters, match):
     [
         ((0.0, 500.0, 400.0), (0.0, 5.0, 6.0), "'image_height_um' must have at least two values that ascend from 0"),
         ((10.0, 500.0), (0.0, 5.0), "'image_height_um' must have at least two values that ascend from 0"),
-        ((0.0, 500.0), (0.0, 5.0, 9.0), "'angle_deg' must have one angle for each of the 2 heights, got 3"),
+        ((0.0, 500.0), (0.0, 5.0, 9.0), "'angle_deg' must have one value for each of the 2 heights, got 3"),
         ((0.0, 500.0), (2.0, 5.0), "'angle_deg' must be 0 on the axis, got 2.0 degrees"),
         ((0.0, 500.0), (0.0, 95.0), "'angle_deg' must be <= 80 everywhere, got 95"),
     ],

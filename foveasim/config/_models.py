@@ -25,7 +25,7 @@ from foveasim.distortion import LENSES
 from foveasim.errors import ParameterError
 from foveasim.layout import EDITS, LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing, read_layout
 from foveasim.maps import read_power_map
-from foveasim.optics import PUPILS, ChiefRayTable, LateralColour, Optics, Seidel, Zernike
+from foveasim.optics import PUPILS, ChiefRayTable, IlluminationTable, LateralColour, Optics, Seidel, Zernike, read_psfs
 from foveasim.scene import SCENES
 from foveasim.sensor import (
     PIXEL_OPTICS,
@@ -242,6 +242,8 @@ def _models(_versions: tuple[int, ...]) -> Models:
         pupil=pupil | list[pupil] | None,  # type: ignore[valid-type]
         zernike=_model("zernike", Zernike) | None,
         seidel=_model("seidel", Seidel) | None,
+        psfs=_model("PSFs", read_psfs, **_FILE_TYPES) | None,
+        relative_illumination=_model("relative illumination table", IlluminationTable) | None,
         lateral_colour=_model("lateral colour", LateralColour) | None,
         exit_pupil_mm=float | None,
         chief_ray=_model("chief ray table", ChiefRayTable) | None,

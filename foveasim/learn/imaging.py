@@ -92,6 +92,8 @@ class Imaging(nn.Module):
         if optics.lateral_colour is not None:
             raise ParameterError("optics", "must have no lateral chromatic aberration for gradients", optics)
         self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
+        if self.wrt and optics.psfs is not None:
+            raise ParameterError("wrt", "must be empty for a lens with 'psfs', whose aberrations are fixed", self.wrt)
         initial = optics.resolve_oversample(scene)
         self._optics = replace(initial, precision="double")
         if self.wrt and initial.is_varying and initial.field_patches is None:
@@ -100,7 +102,9 @@ class Imaging(nn.Module):
             # A sampled aperture without aberrations.
             self._optics = replace(self._optics, zernike=Zernike(coefficients={4: 0.0}))
         self._scene = scene
-        self._aperture: Aperture = self._optics.aperture(scene)
+        aperture = self._optics.aperture(scene)
+        # Of variables only, which lenses with sampled PSFs do not have.
+        self._aperture: Any = aperture if isinstance(aperture, Aperture) else None
         self._imaging, self._tables_at = self._optics.imaging(scene, np.eye(scene.wavelength_nm.size))
         # Weights of the modes over the field, the mean first.
         weights = [np.ones(scene.basis.shape[1:]), *(each.at_pixels() for each in self._imaging.field_weights)]

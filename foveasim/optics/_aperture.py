@@ -65,6 +65,69 @@ class Wavefront(Protocol):
         """
 
 
+class PSFModel(Protocol):
+    """
+    PSFs of a lens at all positions of the field, from its aperture or from samples.
+
+    Lengths are in units of λN, or of two samples if these are coarser.
+    """
+
+    @property
+    def pupils(self) -> Sequence[Pupil]:
+        """Amplitude transmissions, multiplied."""
+
+    @property
+    def is_clear_circle(self) -> bool:
+        """Whether the OTF is that of a clear circle in focus."""
+
+    @property
+    def is_achromatic(self) -> bool:
+        """Whether the same samples serve all wavelengths."""
+
+    def transmittance(self, wavelength_nm: float) -> float:
+        """Return the transmitted power relative to that of the clear circle."""
+
+    def edge(self, wavelength_nm: float) -> float:
+        """Return the edge length per area of the pupil, relative to a clear circle."""
+
+    def illumination(self, field_um: Floats) -> Floats | None:
+        """Return the relative illumination at positions (n, 2), None for that of a thin lens."""
+
+    def blur_lambda_n(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
+        """Return the radius of the blur without diffraction."""
+
+    def n_across(self, wavelength_nm: float, field_um: tuple[float, float]) -> int:
+        """Return the frequency steps per cut-off frequency that the table of an OTF requires."""
+
+    def sampled_psf(
+        self, wavelength_nm: float, n_across: int, radius: int, field_um: tuple[float, float], real: Any
+    ) -> NDArray[np.floating[Any]]:
+        """Sample the PSF at multiples of half a unit, up to ``radius`` of them along each axis."""
+
+    def compute_otf(
+        self,
+        wavelength_nm: float,
+        n_across: float,
+        n_lags: int,
+        field_um: tuple[float, float],
+        real: type[np.floating[Any]],
+    ) -> NDArray[np.complexfloating[Any]]:
+        """Compute the OTF at frequencies ``k / n_across``, k from -n_lags to n_lags."""
+
+    def psf_per_um2(
+        self, wavelength_nm: float, lambda_n_um: float, x_um: Floats, y_um: Floats, field_um: tuple[float, float]
+    ) -> Floats:
+        """Sample the PSF, 1/µm², at points (y, x), (n_y, n_x)."""
+
+    def strehl(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
+        """Return the PSF at the image point relative to that without aberrations."""
+
+    def otf(
+        self, wavelength_nm: float, s_x: Floats, s_y: Floats, field_um: tuple[float, float]
+    ) -> NDArray[np.complex128] | None:
+        """Return the OTF at frequencies, or None if it must be interpolated."""
+
+
 @runtime_checkable
 class EdgedPupil(Protocol):
     """Pupil that specifies where it is discontinuous."""
@@ -117,6 +180,14 @@ class Aperture:
     pupils: Sequence[Pupil]
     wavefronts: Sequence[Wavefront]
     defocus_um: float
+
+    @property
+    def is_clear_circle(self) -> bool:
+        """Whether the OTF is that of a clear circle in focus."""
+        return not self.pupils and not self.wavefronts and self.defocus_um == 0.0
+
+    def illumination(self, field_um: Floats) -> None:
+        """Return None: the relative illumination is that of the thin lens."""
 
     @cached_property
     def is_achromatic(self) -> bool:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from foveasim._core.threads import parallel_map
 from foveasim._core.validation import Floats
 from foveasim.fields import Grid
-from foveasim.optics._aperture import Aperture
+from foveasim.optics._aperture import PSFModel
 
 #: Points along each side of the picture at which PSFs are computed.
 FIELD_POINTS = 9
@@ -117,7 +117,7 @@ def field_points_um(grid: Grid, n_points: int) -> Floats:
 
 
 def find_modes(
-    aperture: Aperture,
+    aperture: PSFModel,
     grid: Grid,
     wavelength_nm: Floats,
     *,
@@ -213,7 +213,7 @@ def _number_of_modes(
 
 
 def sampled_psfs(
-    aperture: Aperture, points_um: Floats, wavelength_nm: Floats, n_threads: int, real: Any = np.float32
+    aperture: PSFModel, points_um: Floats, wavelength_nm: Floats, n_threads: int, real: Any = np.float32
 ) -> NDArray[Any]:
     """
     Return samples of the PSFs at points of the field, at multiples of λN/2.

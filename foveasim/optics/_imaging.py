@@ -30,7 +30,7 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Images, Ints
 from foveasim._io.mapped_files import in_memory
 from foveasim.fields import Grid
-from foveasim.optics._aperture import Aperture
+from foveasim.optics._aperture import PSFModel
 from foveasim.optics._field_modes import FieldWeight
 from foveasim.optics._transform import Factor, Transform, source_pixels
 from foveasim.optics.otf import Tables
@@ -94,6 +94,8 @@ class Imaging:
     weights: Floats
     # Weights of the modes but the mean over the field.
     field_weights: Sequence[FieldWeight]
+    # Relative illumination, in addition to the power of the cosine; none if it is 1.
+    illumination: Sequence[FieldWeight]
     # Squared tangents of the angles to the axis, (n_x,) and (n_y,), and exponent of the cosine.
     tangent2_x: Floats
     tangent2_y: Floats
@@ -174,7 +176,7 @@ class Imaging:
 
         def write_spectrum(b: int, out: NDArray[Any], after: Columns | None) -> None:
             b, mode = divmod(b, 1 + len(self.field_weights))
-            weights = self.field_weights[mode - 1 : mode] if mode else ()
+            weights = [*self.illumination, *(self.field_weights[mode - 1 : mode] if mode else ())]
             image = in_memory(self.basis[b])
             transform.forward(image, self.tangent2_x, self.tangent2_y, self.falloff_power, out, weights, after)
 
@@ -255,6 +257,10 @@ class Imaging:
         """Return the weights of the pixels of a patch, times the relative illumination."""
         x2, y2 = self.tangent2_x[columns.sources], self.tangent2_y[rows.sources]
         illumination: Floats = (1.0 + x2 + y2[:, np.newaxis]) ** (-0.5 * self.falloff_power)
+        for part in self.illumination:
+            illumination = (
+                illumination * FieldWeight(part.along_y[rows.sources], part.profiles[:, columns.sources]).at_pixels()
+            )
         return np.outer(rows.weight, columns.weight) * illumination
 
     def patch_maps(self, rows: PatchExtent, columns: PatchExtent, table_of: Tables) -> Iterator[MapRows]:
@@ -318,7 +324,7 @@ def rows_of(cells: NDArray[Any], first: int, last: int) -> NDArray[Any]:
 
 
 def isoplanatic_error(
-    aperture: Aperture, grid: Grid, n_patches: tuple[int, int], wavelength_nm: float, lambda_n_um: float
+    aperture: PSFModel, grid: Grid, n_patches: tuple[int, int], wavelength_nm: float, lambda_n_um: float
 ) -> float:
     """
     Return the largest fraction of PSF energy displaced by the isoplanatic patches.

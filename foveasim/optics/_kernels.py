@@ -61,8 +61,8 @@ def _weigh(line, factors, profiles):
     ],
 )
 def apply_falloff(rows, x2, y2, power, along_y, profiles, source_column, n_before, out):
+    """
     Write rows of a picture times ``cos(theta) ** power`` and functions, padded.
-    Write rows of a picture times ``cos(theta) ** power`` and further functions, padded on both sides.
 
     ``x2`` and ``y2`` are (x0/H)² of the picture columns and (y0/H)² of the rows, so that ``cos² = 1 / (1 + x2 + y2)``. The
     functions are ``along_y[k] @ profiles[k]``, (n_function, n_row, n) and (n_function, n, n_x).

@@ -21,15 +21,18 @@ from foveasim._core.validation import Bools, Floats, check_number, check_point, 
 from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.incidence import N_RINGS, N_RINGS_OF_PUPILS, ChiefRayTable, Incidence
-from foveasim.optics._aperture import Aperture, Wavefront, overlaps
+from foveasim.optics._aperture import Aperture, PSFModel, Wavefront, overlaps
+from foveasim.optics._illumination import IlluminationTable
 from foveasim.optics._point_images import Point, PointImages
 from foveasim.optics.aberrations import LateralColour, Seidel, Zernike
 from foveasim.optics.otf import MAX_ALIASES, ONE_POINT, PlaneTables, RadialTables, TableCache, Tables
+from foveasim.optics.psfs._field import FieldPSFs
+from foveasim.optics.psfs._grid import PSFGrid
 from foveasim.optics.pupils import Pupil
 from foveasim.units import m_from_mm, m_from_um, um_from_m, um_from_nm
 
 if TYPE_CHECKING:
-    from foveasim.optics._field_modes import FieldModes
+    from foveasim.optics._field_modes import FieldModes, FieldWeight
     from foveasim.optics._imaging import Imaging, MapRows
     from foveasim.optics._transform import Factor, Transform
 
@@ -53,6 +56,10 @@ MAX_OVERSAMPLE = 16
 FINE_CELLS_PER_LAMBDA_N = 5.5
 #: Largest relative error for photosites of side λN and n cells per λN, ``CELL_ERROR * n ** CELL_ERROR_POWER``, and its limit.
 CELL_ERROR, CELL_ERROR_POWER, LARGEST_CELL_ERROR = 0.16, -3.1, 0.2
+#: Points along each side of the picture between which the relative illumination is interpolated.
+ILLUMINATION_POINTS = 33
+#: Rounding error of interpolated relative illumination.
+ILLUMINATION_ROUNDING = 1e-12
 #: Memory limit of a map: 16 GiB in single precision.
 MAX_CELLS = 1 << 32
 #: Memory limit of a map with automatic oversampling: 512 MiB in single precision.
@@ -109,6 +116,11 @@ class Optics(PointImages):
         Aberrations that are constant over the field; each may depend on the wavelength.
     seidel : Seidel, optional
         Aberrations that depend on the distance from the axis.
+    psfs : PSFGrid, optional
+        Point spread functions from another program or a measurement, at any distance of the scene, instead of ``pupil``,
+        ``zernike`` and ``seidel``.
+    relative_illumination : IlluminationTable, optional
+        Irradiance over image height, instead of the falloff of ``emission`` and the relative illumination of ``psfs``.
     focus_distance_m : float, optional, m
         Distance at which the lens is focused, infinity allowed; by default the distance of the scene. Scenes at other
         distances are defocused.
@@ -185,6 +197,8 @@ class Optics(PointImages):
     pupil: OwnCheck[Pupil | Sequence[Pupil] | None] = None
     zernike: Zernike | None = None
     seidel: Seidel | None = None
+    psfs: PSFGrid | None = None
+    relative_illumination: IlluminationTable | None = None
     focus_distance_m: Annotated[float | None, Usual(0.05, 100.0)] = None
     lateral_colour: LateralColour | None = None
     field_patches: Annotated[int | None, Limits(at_least=1, at_most=64), Usual(1, 15)] = None
@@ -214,6 +228,14 @@ class Optics(PointImages):
             raise ParameterError(
                 "pupil", "must be a pupil of foveasim.optics, or a callable T(x, y, wavelength_nm)", self.pupil
             )
+        if self.psfs is not None:
+            for name in ("pupil", "zernike", "seidel"):
+                if getattr(self, name) is not None:
+                    raise ParameterError(name, "must not be given with 'psfs', which contain it", getattr(self, name))
+            if self.relative_illumination is not None and self.psfs.relative_illumination is not None:
+                raise ParameterError(
+                    "relative_illumination", "must not be given with that of 'psfs'", self.relative_illumination
+                )
         if self.exit_pupil_mm is not None:
             distance_mm = self.exit_pupil_mm
             if distance_mm != math.inf:
@@ -456,7 +478,7 @@ class Optics(PointImages):
             When the scene is not a Scene or is too near, the pupil is empty, or the aberrations exceed the largest blur.
         """
         grid, aperture = self.grid(scene), self._aperture(scene.distance_m)
-        if not self._is_clear_circle(aperture):
+        if not aperture.is_clear_circle:
             for wave_nm in scene.wavelength_nm:
                 aperture.transmittance(float(wave_nm))
                 for point_um in self._field_points_um(grid):
@@ -629,7 +651,7 @@ class Optics(PointImages):
         grid = self._refine(self.grid(scene)) if grid is None else grid
         lambda_n_um = self._lambda_n_um(scene)
         aperture = self._aperture(scene.distance_m)
-        is_clear_circle = self._is_clear_circle(aperture)
+        is_clear_circle = aperture.is_clear_circle
         pixels = Grid.centred(
             (scene.basis.shape[1], scene.basis.shape[2]), grid.pitch_x_um * self._n_fine, grid.centre_um
         )
@@ -651,6 +673,9 @@ class Optics(PointImages):
             )
             weights = np.tile(weights, n_modes)
         tangent2_x, tangent2_y = self._squared_tangents(scene)
+        illumination = self._illumination(pixels, aperture)
+        if illumination is not None:
+            tangent2_x, tangent2_y = np.zeros_like(tangent2_x), np.zeros_like(tangent2_y)
         # Cache key: a factor depends on these, the lens and the weights.
         place = None if modes is None else grid.bounds_um
         spectrum_key = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um, self._n_fine, place
@@ -672,6 +697,7 @@ class Optics(PointImages):
             * (_pitch_um(scene) * self.magnification(scene.distance_m) / pixels.pitch_x_um) ** 2,
             weights=weights,
             field_weights=[] if modes is None else modes.weights(pixels.shape),
+            illumination=illumination or [],
             tangent2_x=tangent2_x,
             tangent2_y=tangent2_y,
             falloff_power=4 if self.emission == "lambertian" else 3,
@@ -773,13 +799,12 @@ class Optics(PointImages):
         if distance_m is None:
             distance_m = float("inf") if self.focus_distance_m is None else self.focus_distance_m
         distance_m = self._check_distance("distance_m", distance_m)
-        n = self.f_number * self._image_distance_mm(distance_m) / self.focal_length_mm
         aperture = self._aperture(distance_m)
         return Point(
             aperture=aperture,
-            is_clear_circle=self._is_clear_circle(aperture),
+            is_clear_circle=aperture.is_clear_circle,
             wavelength_nm=wave_nm,
-            lambda_n_um=float(um_from_nm(wave_nm)) * n,
+            lambda_n_um=float(self._cut_off_um(wave_nm, distance_m)),
             field_um=check_point("field_um", field_um),
         )
 
@@ -790,11 +815,14 @@ class Optics(PointImages):
             return ()
         return tuple(self.pupil) if isinstance(self.pupil, Sequence) else (self.pupil,)
 
-    def aperture(self, scene: SceneLike) -> Aperture:
-        """Return the aperture for the distance of a scene."""
+    def aperture(self, scene: SceneLike) -> PSFModel:
+        """Return the aperture, or the sampled PSFs, for the distance of a scene."""
         return self._aperture(scene.distance_m)
 
-    def _aperture(self, distance_m: float) -> Aperture:
+    def _aperture(self, distance_m: float) -> PSFModel:
+        psfs = self.psfs
+        if psfs is not None:
+            return self._cache.aperture(distance_m, lambda: FieldPSFs.at(psfs, self.working_f_number(distance_m)))
         wavefronts: list[Wavefront] = [part for part in (self.zernike, self.seidel) if part is not None]
         return self._cache.aperture(
             distance_m, lambda: Aperture(self._pupils(), wavefronts, self._defocus_um(distance_m))
@@ -803,14 +831,15 @@ class Optics(PointImages):
     @property
     def is_varying(self) -> bool:
         """Whether the PSF varies over the field."""
-        return self.seidel is not None and self.seidel.is_varying
-
-    @staticmethod
-    def _is_clear_circle(aperture: Aperture) -> bool:
-        return not aperture.pupils and not aperture.wavefronts and aperture.defocus_um == 0.0
+        return any(part is not None and part.is_varying for part in (self.seidel, self.psfs))
 
     def _lambda_n_um(self, scene: SceneLike) -> Floats:
-        return np.asarray(um_from_nm(scene.wavelength_nm) * self.working_f_number(scene.distance_m))
+        """Return λN at the wavelengths of a scene, or two samples of PSFs if these are coarser."""
+        return self._cut_off_um(scene.wavelength_nm, scene.distance_m)
+
+    def _cut_off_um(self, wavelength_nm: Floats | float, distance_m: float) -> Floats:
+        lambda_n_um = np.asarray(um_from_nm(wavelength_nm) * self.working_f_number(distance_m))
+        return lambda_n_um if self.psfs is None else np.maximum(lambda_n_um, 2.0 * self.psfs.pitch_um)
 
     def _field_points_um(self, grid: Grid) -> list[tuple[float, float]]:
         """Return the field points with the strongest aberrations."""
@@ -819,7 +848,7 @@ class Optics(PointImages):
         corners = [(x_um + sx * half_x_um, y_um + sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
         return [(0.0, 0.0), *(corners if self.is_varying else ())]
 
-    def _blur_um(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats) -> float:
+    def _blur_um(self, scene: SceneLike, grid: Grid, aperture: PSFModel, lambda_n_um: Floats) -> float:
         """Return the largest geometric ray displacement on the sensor."""
         return max(
             aperture.blur_lambda_n(float(wave_nm), point_um) * float(near_um)
@@ -828,7 +857,7 @@ class Optics(PointImages):
         )
 
     def _reach_cells(
-        self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats, lost_fraction: float
+        self, scene: SceneLike, grid: Grid, aperture: PSFModel, lambda_n_um: Floats, lost_fraction: float
     ) -> int:
         """Return the radius in cells that contains all but a fraction of the PSF energy."""
         from foveasim.optics._imaging import reach_cells
@@ -862,6 +891,18 @@ class Optics(PointImages):
                 "f-number, and check the units of pitch_um, distance_m and focal_length_mm",
                 SamplingWarning,
             )
+
+    def _illumination(self, pixels: Grid, aperture: PSFModel) -> list[FieldWeight] | None:
+        """Return the relative illumination of pixels: None for that of the emission, empty if 1."""
+        from foveasim.optics._field_modes import field_points_um, field_weights
+
+        points_um = field_points_um(pixels, ILLUMINATION_POINTS)
+        table = self.relative_illumination
+        values = aperture.illumination(points_um.reshape(-1, 2)) if table is None else table.at(points_um)
+        if values is None:
+            return None
+        is_one = (np.abs(values - 1.0) <= ILLUMINATION_ROUNDING).all()
+        return [] if is_one else field_weights(values.reshape(1, *points_um.shape[:2]), pixels.shape)
 
     def _squared_tangents(self, scene: SceneLike) -> tuple[Floats, Floats]:
         """Return (x0/H)² of the scene columns and (y0/H)² of the scene rows."""

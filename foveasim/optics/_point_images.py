@@ -18,7 +18,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, finite_array
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
-from foveasim.optics._aperture import Aperture
+from foveasim.optics._aperture import PSFModel
 from foveasim.optics.otf import circular_otf
 
 #: Default number of PSF samples along either axis, and their pitch in λN.
@@ -67,7 +67,7 @@ class PointSpread:
 class Point:
     """Point source imaged at ``field_um`` on the sensor; N in λN is the image-side f-number."""
 
-    aperture: Aperture
+    aperture: PSFModel
     is_clear_circle: bool
     wavelength_nm: float
     lambda_n_um: float

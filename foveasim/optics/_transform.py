@@ -363,7 +363,11 @@ def _stacked(weights: Sequence[FieldWeight], shape: tuple[int, int], real: Any) 
     n_y, n_x = shape
     if not weights:
         return np.empty((0, n_y, 1), real), np.empty((0, 1, n_x), real)
-    return np.stack([w.along_y for w in weights]).astype(real), np.stack([w.profiles for w in weights]).astype(real)
+    n = max(w.profiles.shape[0] for w in weights)
+    along_y, profiles = np.zeros((len(weights), n_y, n), real), np.zeros((len(weights), n, n_x), real)
+    for k, each in enumerate(weights):
+        along_y[k, :, : each.along_y.shape[1]], profiles[k, : each.profiles.shape[0]] = each.along_y, each.profiles
+    return along_y, profiles
 
 
 def _interpolation(x: Floats, n_nodes: int) -> Floats:

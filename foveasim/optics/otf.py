@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.threads import ForkSafeLock, cached_property, parallel_map
 from foveasim._core.validation import Floats, as_numbers
-from foveasim.optics._aperture import Aperture
+from foveasim.optics._aperture import PSFModel
 
 __all__ = ["MAX_ALIASES", "PlaneTables", "RadialTables", "Tables", "circular_otf"]
 
@@ -111,7 +111,7 @@ class PlaneTables:
 
     def __init__(
         self,
-        aperture: Aperture,
+        aperture: PSFModel,
         wavelength_nm: Floats,
         lambda_n_um: Floats,
         points_um: Sequence[tuple[float, float]],
@@ -210,13 +210,13 @@ class TableCache:
         self._lock = ForkSafeLock()
         self._tables: dict[tuple[Hashable, Hashable], PlaneTables] = {}
         self._modes: dict[Hashable, Any] = {}
-        self._apertures: dict[float, Aperture] = {}
+        self._apertures: dict[float, PSFModel] = {}
         self._factors: dict[tuple[Hashable, bytes], NDArray[Any] | None] = {}
 
     def __reduce__(self) -> tuple[type[TableCache], tuple[()]]:
         return TableCache, ()
 
-    def aperture(self, distance_m: float, create: Callable[[], Aperture]) -> Aperture:
+    def aperture(self, distance_m: float, create: Callable[[], PSFModel]) -> PSFModel:
         """Return the aperture for a scene distance; the most recently used ones are cached."""
         with self._lock:
             aperture = self._apertures.pop(distance_m) if distance_m in self._apertures else create()

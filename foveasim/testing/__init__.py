@@ -25,6 +25,7 @@ curve             parameters                                                    
 scene             parameters                                                     picture of cells, top row first: ``#``
                                                                                  for bright, ``.`` for dark, else a space
 pupil             parameters                                                     transmitted fraction of the power
+PSF format        as layout formats; returns a PSFGrid
 lens model        parameters                                                     mapping of ideal to real points, µm
 metric            none
 ================  =============================================================  =========================================
@@ -50,7 +51,7 @@ from foveasim._io.formats import one_line
 from foveasim.errors import ParameterError
 from foveasim.testing._effects import check_effect, check_sensor_effect
 from foveasim.testing._extension import Check, Extension
-from foveasim.testing._files import check_cube_format, check_layout_format, check_map_format
+from foveasim.testing._files import check_cube_format, check_layout_format, check_map_format, check_psf_format
 from foveasim.testing._layouts import check_derived_layer, check_edit, check_family, check_rule
 from foveasim.testing._lenses import check_curve, check_lens, check_pupil
 from foveasim.testing._metrics import check_metric
@@ -67,7 +68,7 @@ CHECKS: dict[str, Check] = {
     for check in (
         check_family, check_edit, check_rule, check_layout_format, check_derived_layer, check_map_format, check_effect,
         check_pixel_optics,
-        check_curve, check_cube_format, check_scene, check_pupil, check_lens, check_metric,
+        check_curve, check_cube_format, check_scene, check_pupil, check_psf_format, check_lens, check_metric,
     )
 }  # fmt: skip
 

@@ -14,6 +14,7 @@ from foveasim.errors import FoveasimError
 from foveasim.fields import Grid, PowerMap
 from foveasim.layout import FORMATS, Layout, grid
 from foveasim.maps import MAP_FORMATS, read_power_map, write_power_map
+from foveasim.optics import PSF_FORMATS, PSFGrid, read_psfs
 from foveasim.scene import CUBE_FORMATS, Scene
 from foveasim.testing._extension import Extension, check_of, require
 
@@ -89,6 +90,42 @@ def _cube_difference(scene: Scene, expected: Any) -> str:
         return f"returns radiance of shape {radiance.shape}, expected {np.shape(expected)}"
     if not np.allclose(radiance, expected, rtol=RELATIVE):
         return "returns another radiance; check units, and that row 0 is the lowest row"
+    return ""
+
+
+@check_of(PSF_FORMATS)
+def check_psf_format(extension: Extension) -> None:
+    """Check a format of PSFs."""
+    values = np.zeros((3, 2, 33, 37))  # more than the blocks to which files are padded
+    values[..., 5:-5, 5:-5] = np.arange(3 * 2 * 23 * 27).reshape(3, 2, 23, 27)  # without symmetry
+    standard = PSFGrid(
+        psf=values,
+        x_um=np.array([0.0, 1.0, 2.0]),
+        y_um=np.array([0.0, 2.0, 4.0]),
+        wavelength_nm=np.array([450.0, 550.0]),
+        pitch_um=0.5,
+        samples="bins",
+        relative_illumination=np.array([[1.0, 1.0], [0.9, 0.8], [0.7, 0.6]]),
+    )
+    _check_format(extension, read_psfs, standard.write, standard, _psf_difference)
+
+
+def _psf_difference(found: PSFGrid, expected: PSFGrid) -> str:
+    if found.psf.shape != expected.psf.shape:
+        return f"returns PSFs of shape {found.psf.shape}, expected {expected.psf.shape}"
+    if not np.allclose(found.psf, expected.psf, atol=RELATIVE * expected.psf.max()):
+        return "returns other values; check that PSFs are upright, with row 0 as the lowest row"
+    if not all(np.allclose(getattr(found, at), getattr(expected, at), atol=POSITION_UM) for at in ("x_um", "y_um")):
+        return "returns other points of the field; check units, and that they are those of the upright picture"
+    if not np.allclose(found.wavelength_nm, expected.wavelength_nm) or not np.isclose(
+        found.pitch_um, expected.pitch_um
+    ):
+        return "returns other wavelengths or another distance of the samples"
+    if found.samples != expected.samples:
+        return f"returns samples={found.samples!r}, expected {expected.samples!r}"
+    one, other = found.relative_illumination, expected.relative_illumination
+    if (one is None) != (other is None) or (one is not None and other is not None and not np.allclose(one, other)):
+        return "returns another relative illumination"
     return ""
 
 

@@ -50,6 +50,10 @@ EXAMPLES = {
     "refractive_index": 1.5,
     "image_height_um": (0.0, 100.0),
     "angle_deg": (0.0, 10.0),
+    "fraction": (1.0, 0.9),
+    "psf": np.pad(np.ones((1, 1, 1, 1)), ((0, 0), (0, 0), (2, 2), (2, 2))),
+    "x_um": [0.0],
+    "y_um": [0.0],
 }
 #: Parameters that others require.
 COMPANIONS = {

@@ -20,6 +20,7 @@ from foveasim.config._models import models
 from foveasim.config._objects import put_setting
 from foveasim.explore.worker_cache import ShotRunner, WorkerCache
 from foveasim.layout import Layout
+from foveasim.optics import PSFGrid
 from foveasim.sensor.effects import EFFECTS, FixedFactor
 
 
@@ -134,6 +135,8 @@ OTHERS = {
     "optics.lateral_colour.wavelength_nm": [450.0, 660.0],
     "optics.lateral_colour.magnification": [0.999, 1.002],
     "optics.seidel": {"spherical_um": 0.1},
+    "optics.psfs": {"path": "psfs.npz"},
+    "optics.relative_illumination": {"image_height_um": [0.0, 1e4], "fraction": [1.0, 0.5]},
     "optics.focus_distance_m": 0.9,
     "optics.oversample": 3,
     "optics.field_modes": 3,
@@ -306,6 +309,8 @@ def runner(tmp_path, monkeypatch):
     rng = np.random.default_rng(5)
     for name in ("picture.png", "other.png"):
         write_picture(tmp_path / name, rng.integers(0, 256, (20, 24, 3), dtype=np.uint8))
+    spot = np.exp(-0.5 * np.square(np.hypot(*np.mgrid[-12:13, -12:13])))
+    PSFGrid.from_arrays(spot, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0).write(tmp_path / "psfs.npz")
     np.save(tmp_path / "map.npy", rng.random((24, 24)))
     monkeypatch.chdir(tmp_path)
     returned = {}

@@ -31,6 +31,13 @@ MANY = np.linspace(0.0, 1.0, 1000)
 TABLE = tuple(np.linspace(400.0, 700.0, 200))
 SITES = fs.layout.grid(40, 30, 2.0)
 OPTICS = fs.Optics(focal_length_mm=8.0, f_number=2.8)
+PSFS = optics.PSFGrid(
+    psf=np.pad(np.ones((3, 1, 1, 1)), ((0, 0), (0, 0), (9, 9), (9, 9))),
+    x_um=np.arange(3.0),
+    y_um=np.zeros(3),
+    wavelength_nm=np.array([550.0]),
+    pitch_um=1.0,
+)
 SENSOR = fs.Sensor(SITES, read_noise_e=np.full(SITES.n_sites, 2.0))
 CAMERA = fs.Camera(optics=OPTICS, sensor=SENSOR)
 GRID = fs.Grid((100, 200), 0.5)
@@ -93,6 +100,7 @@ def public_objects(directory):
         optics.Annulus(0.3), optics.Blades(5), optics.LateralColour(wavelength_nm=TABLE, magnification=(1.0,) * 200),
         optics.PointSpread(psf_per_um2=np.ones(GRID.shape), grid=GRID, wavelength_nm=550.0),
         optics.ChiefRayTable(image_height_um=np.arange(200.0), angle_deg=0.1 * np.arange(200.0)), OPTICS.incidence(SITES.centroid_um),
+        optics.IlluminationTable(image_height_um=np.arange(200.0), fraction=np.linspace(1.0, 0.5, 200)), PSFS,
         optics.PupilImage(np.ones((64, 64))), optics.Seidel(coma_um=0.1), optics.Slit(0.1), optics.Slit(0.1).edges(), optics.Spider(3, 0.1),
         optics.Zernike(coefficients=dict.fromkeys(range(4, 30), 0.01)),
         distortion.BrownConrady(focal_um=8000.0, k1=-0.1), distortion.Fisheye(projection="equidistant", focal_um=8000.0),

@@ -14,7 +14,7 @@ from foveasim.distortion import LENSES
 from foveasim.explore import METRICS
 from foveasim.layout import DERIVED_LAYERS, FORMATS, RULES, FileFormat, Rule, WrittenLayout, layout_edit, layout_family
 from foveasim.maps import MAP_FORMATS, Found
-from foveasim.optics import PUPILS
+from foveasim.optics import PSF_FORMATS, PUPILS, PSFGrid
 from foveasim.scene import CUBE_FORMATS, SCENES
 from foveasim.sensor import PIXEL_OPTICS, Footprints, PixelOptics
 from foveasim.sensor.effects import EFFECTS, AdditiveNoise, Collection
@@ -155,6 +155,23 @@ def example_lines(path: Path) -> np.ndarray:
 
 lines = FileFormat(title="lines", suffixes=(".lines",), signatures=(b"LINES",), read=read_lines)
 CUBE_FORMATS.register("lines", lines, example=example_lines)
+
+
+def read_spot(path: Path) -> PSFGrid:
+    """Read a PSF of samples of 1 µm at 550 nm, lowest row first, after a header line."""
+    values = np.loadtxt(path, skiprows=1, ndmin=2)
+    return PSFGrid.from_arrays(values, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0)
+
+
+def example_spot(path: Path) -> PSFGrid:
+    """Write a PSF without symmetry."""
+    values = np.pad([[1.0, 2.0], [4.0, 8.0]], 2)
+    path.write_text("SPOT\n" + "\n".join(" ".join(map(str, row)) for row in values), encoding="utf-8")
+    return PSFGrid.from_arrays(values, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0)
+
+
+spot = FileFormat(title="spot", suffixes=(".spot",), signatures=(b"SPOT",), read=read_spot)
+PSF_FORMATS.register("spot", spot, example=example_spot)
 
 
 def example_powers(path: Path) -> fs.PowerMap:

@@ -1,0 +1,100 @@
+"""Registry of PSF formats, reading and writing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from foveasim._core.calls import publish
+from foveasim._core.names import did_you_mean
+from foveasim._core.registry import Registry
+from foveasim._io.atomic import atomic_write
+from foveasim._io.formats import FileFormat, FormatError, as_file_error, detect_format, select_writer
+from foveasim.errors import FileError
+from foveasim.optics.psfs._grid import PSFGrid
+
+__all__ = ["PSF_FORMATS", "read_psfs"]
+
+#: Formats of PSFs. ``read(path)`` returns a :class:`PSFGrid`, ``write(psfs, path)`` None. Installed packages add formats as
+#: entry points of the group ``foveasim.psf_formats``.
+PSF_FORMATS: Registry[FileFormat] = Registry("PSF format", "foveasim.psf_formats")
+#: Conventions of the frame and the values, in files.
+Image = Literal["upright", "inverted"]
+FirstRow = Literal["lowest", "highest"]
+Samples = Literal["points", "bins"]
+CHOICES: dict[str, tuple[str, ...]] = {
+    "image": get_args(Image),
+    "first_row": get_args(FirstRow),
+    "samples": get_args(Samples),
+}
+
+
+def read_psfs(path: str | Path) -> PSFGrid:
+    """
+    Read point spread functions from a file.
+
+    Parameters
+    ----------
+    path : path
+        An ``.npz`` or FITS stack, a text export of Zemax OpticStudio, or a YAML index of such exports: see the guide of the
+        optics.
+
+    Returns
+    -------
+    PSFGrid
+
+    Raises
+    ------
+    FileError
+        When a file is missing, too large, of another format, or not consistent.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> lens = fs.Optics(focal_length_mm=8.0, f_number=8.0)
+    >>> h = lens.psf(550.0, pitch_um=2.0, n_points=65).psf_per_um2
+    >>> psfs = fs.optics.PSFGrid.from_arrays(h, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=2.0)
+    >>> with TemporaryDirectory() as folder:
+    ...     psfs.write(Path(folder) / "lens.npz")
+    ...     fs.optics.read_psfs(Path(folder) / "lens.npz")
+    PSFGrid(1 point, 550 nm, 65 x 65 samples of 2 µm)
+    """
+    source = Path(path)
+    _, form = detect_format(source, PSF_FORMATS, "file of PSFs")
+    assert form.read is not None
+    with as_file_error(source, "file of PSFs", passes=(FileError,)):
+        found = form.read(source)
+        if not isinstance(found, PSFGrid):
+            raise FormatError(f"must be read as a PSFGrid, got {type(found).__name__}")
+        return found
+
+
+def write(psfs: PSFGrid, path: Path) -> None:
+    """Write PSFs in the format of a file's extension, atomically."""
+    form = select_writer(path, PSF_FORMATS)
+    assert form.write is not None
+    with atomic_write(path) as temporary:
+        form.write(psfs, temporary)
+
+
+def choices_of(given: dict[str, Any]) -> dict[str, Any]:
+    """Return the conventions among the values of a file; raise a FormatError for unknown ones."""
+    found = {name: str(given[name]) for name in CHOICES if given.get(name) is not None}
+    for name, value in found.items():
+        if value not in CHOICES[name]:
+            every = " or ".join(map(repr, CHOICES[name]))
+            hint = did_you_mean(value, CHOICES[name])
+            raise FormatError(f"must have {every} as '{name}', got {value!r:.40}{'; ' * bool(hint)}{hint}")
+    return found
+
+
+def require(given: Any, names: tuple[str, ...]) -> None:
+    """Raise a FormatError that names the first missing value of a file."""
+    for name in names:
+        if name not in given:
+            raise FormatError(f"has no '{name}', which files of PSFs must contain")
+
+
+publish(__name__)

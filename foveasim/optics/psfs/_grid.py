@@ -1,0 +1,399 @@
+"""Point spread functions at points of the field, in the frame of the upright picture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim._core.calls import LENGTH
+from foveasim._core.threads import cached_property
+from foveasim._core.user_warnings import warn
+from foveasim._core.validation import (
+    Floats,
+    Ints,
+    as_numbers,
+    check_length_um,
+    finite_array,
+    read_only,
+    wavelengths_nm,
+)
+from foveasim.errors import ParameterError, SamplingWarning
+
+#: Largest number of values: 2 GiB in double precision.
+MAX_VALUES = 1 << 28
+#: Largest number of field points and of samples along a side.
+MAX_POINTS, MAX_SIDE = 4096, 8192
+#: Relative tolerance of equal coordinates, over the extent of the field.
+SAME = 1e-6
+#: Fraction of the light beyond the window of a PSF above which a warning is issued.
+MAX_BEYOND = 0.05
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PSFGrid:
+    """
+    Point spread functions of a lens over its field, from another program or a measurement.
+
+    Created by :meth:`from_arrays`, which converts from the conventions of other programs, or :func:`read_psfs`.
+
+    Parameters
+    ----------
+    psf : (n_point, n_wavelength, n_y, n_x) float32 or float64
+        Irradiance around the image point, row 0 lowest, with odd numbers of rows and columns: the image point is the centre
+        of the middle sample. Each is divided by its sum.
+    x_um, y_um : (n_point,) float64, µm
+        Image points relative to the optical axis, in the upright picture. They form a rectangular grid, lie on one radius of
+        a rotationally symmetric lens, or are one point, whose PSF is that of the whole field.
+    wavelength_nm : (n_wavelength,) float64, nm
+        Ascending. Between two wavelengths the PSF is interpolated linearly, beyond the last it is that of the last.
+    pitch_um : float, µm
+        Distance of the samples.
+    samples : {"points", "bins"}
+        Whether values are those at points, or means over squares around them, such as counts of rays.
+    relative_illumination : (n_point, n_wavelength), optional
+        Irradiance of a uniform scene over that on the axis, in place of cos⁴; by default that of the lens.
+
+    Raises
+    ------
+    ParameterError
+        When shapes differ, values are not finite, a PSF has no positive sum, or points coincide or form no grid or radius.
+
+    Warns
+    -----
+    SamplingWarning
+        When more than 5 % of the light lies beyond the window, by :attr:`beyond_fraction`.
+
+    Notes
+    -----
+    Between the points, PSFs without the displacement of their centroids are interpolated by cubic splines, and displaced by
+    interpolated centroids. Those on a radius are turned around the axis. Beyond the outermost points, the PSF is that of
+    the nearest position within. Frequencies above the cut-off of the lens, ``1 / λN``, are removed.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> spot = np.exp(-0.5 * np.add.outer(np.arange(-8, 9) ** 2, np.arange(-8, 9) ** 2))
+    >>> psfs = fs.optics.PSFGrid.from_arrays(spot, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0)
+    >>> psfs
+    PSFGrid(1 point, 550 nm, 17 x 17 samples of 1 µm)
+    >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8, psfs=psfs)
+    >>> lens.is_varying
+    False
+    """
+
+    psf: NDArray[np.floating[Any]] = field(repr=False)
+    x_um: Floats
+    y_um: Floats
+    wavelength_nm: Floats
+    pitch_um: Annotated[float, LENGTH]
+    samples: Literal["points", "bins"] = "points"
+    relative_illumination: Floats | None = None
+
+    def __repr__(self) -> str:
+        return f"PSFGrid({self.description})"
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "pitch_um", check_length_um("pitch_um", self.pitch_um))
+        waves_nm = np.atleast_1d(wavelengths_nm("wavelength_nm", np.atleast_1d(self.wavelength_nm)))
+        x_um, y_um = (np.atleast_1d(finite_array(name, getattr(self, name))) for name in ("x_um", "y_um"))
+        psf = as_numbers("psf", self.psf, keep_type=True)
+        _check_shape(psf, x_um, y_um, waves_nm)
+        if (np.diff(waves_nm) <= 0.0).any():
+            raise ParameterError("wavelength_nm", "must ascend without equal values", waves_nm.tolist(), "nm")
+        _check_apart(x_um, y_um)
+        real = np.float32 if psf.dtype == np.float32 else np.float64
+        set_(self, "psf", read_only(_normalised(psf, real, x_um, y_um, waves_nm)))
+        for name, values in (("x_um", x_um), ("y_um", y_um), ("wavelength_nm", waves_nm)):
+            set_(self, name, read_only(np.array(values, np.float64)))
+        if self.relative_illumination is not None:
+            fraction = finite_array("relative_illumination", self.relative_illumination, at_least=0.0)
+            if fraction.ndim == 1 and waves_nm.size == 1:
+                fraction = fraction[:, np.newaxis]
+            if fraction.shape != psf.shape[:2]:
+                raise ParameterError(
+                    "relative_illumination",
+                    f"must have the shape (n_point, n_wavelength) = {psf.shape[:2]}, got {fraction.shape}",
+                )
+            if not (fraction.mean(axis=1) > 0.0).all():
+                raise ParameterError("relative_illumination", "must be above 0 at each point for one wavelength")
+            set_(self, "relative_illumination", read_only(fraction.copy()))
+        len(self.axes)  # the points form a grid or a radius
+        beyond = float(self.beyond_fraction.max())
+        if beyond > MAX_BEYOND:
+            warn(
+                f"approximately {beyond:.0%} of the light of a point lies beyond the window of its PSF, {psf.shape[3]} x "
+                f"{psf.shape[2]} samples of {self.pitch_um:g} µm; export a larger window",
+                SamplingWarning,
+            )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        psf: ArrayLike,
+        *,
+        x_um: ArrayLike,
+        y_um: ArrayLike,
+        wavelength_nm: ArrayLike,
+        pitch_um: float,
+        image: Literal["upright", "inverted"] = "upright",
+        first_row: Literal["lowest", "highest"] = "lowest",
+        samples: Literal["points", "bins"] = "points",
+        centre: tuple[int, int] | None = None,
+        relative_illumination: ArrayLike | None = None,
+    ) -> PSFGrid:
+        """
+        Convert PSFs of another program or a measurement.
+
+        Parameters
+        ----------
+        psf : (n_point, n_wavelength, n_y, n_x), (n_point, n_y, n_x) or (n_y, n_x) array
+            Without wavelengths, there is one; without points, there is one.
+        x_um, y_um : (n_point,) array or float, µm
+            Image points relative to the optical axis, in any order.
+        wavelength_nm : (n_wavelength,) array or float, nm
+            In any order.
+        pitch_um : float, µm
+            Distance of the samples.
+        image : {"upright", "inverted"}
+            Whether positions are those in the upright picture, or those in the image that a lens projects, as in lens design.
+            The latter are turned by 180°: ``h(-x, -y)`` at the field point ``(-x, -y)``.
+        first_row : {"lowest", "highest"}
+            Whether row 0 is that of the smallest or the largest y.
+        samples : {"points", "bins"}
+            As for :class:`PSFGrid`.
+        centre : (row, column), optional
+            Indices of the sample at the image point; by default ``(n_y // 2, n_x // 2)``, as after ``fftshift``.
+        relative_illumination : (n_point, n_wavelength) array, optional
+
+        Returns
+        -------
+        PSFGrid
+
+        Raises
+        ------
+        ParameterError
+            As for :class:`PSFGrid`.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> airy = fs.Optics(focal_length_mm=8.0, f_number=4.0).psf(550.0, pitch_um=1.0, n_points=64)
+        >>> psfs = fs.optics.PSFGrid.from_arrays(
+        ...     airy.psf_per_um2, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0, centre=(31, 31)
+        ... )
+        >>> psfs.psf.shape, round(float(psfs.psf.sum()), 12)
+        ((1, 1, 65, 65), 1.0)
+        """
+        waves_nm = np.atleast_1d(as_numbers("wavelength_nm", wavelength_nm))
+        x, y = (np.atleast_1d(as_numbers(name, at)) for name, at in (("x_um", x_um), ("y_um", y_um)))
+        values = as_numbers("psf", psf, keep_type=True)
+        if values.ndim == 2:
+            values = values[np.newaxis, np.newaxis]
+        elif values.ndim == 3:
+            values = values[:, np.newaxis]
+        _check_shape(values, x, y, waves_nm, is_padded=False)
+        values = _centred(values, centre)
+        if first_row == "highest":
+            values = values[..., ::-1, :]
+        if image == "inverted":
+            values, x, y = values[..., ::-1, ::-1], -x, -y
+        order = np.argsort(waves_nm)
+        fraction = None
+        if relative_illumination is not None:
+            fraction = as_numbers("relative_illumination", relative_illumination)
+            fraction = fraction.reshape(-1, 1) if fraction.ndim == 1 and waves_nm.size == 1 else fraction
+            fraction = fraction[:, order] if fraction.shape == values.shape[:2] else fraction
+        return cls(
+            psf=values[:, order],
+            x_um=x,
+            y_um=y,
+            wavelength_nm=waves_nm[order],
+            pitch_um=pitch_um,
+            samples=samples,
+            relative_illumination=fraction,
+        )
+
+    def write(self, path: str | Path) -> None:
+        """
+        Write the PSFs to a file atomically.
+
+        Parameters
+        ----------
+        path : path
+            With the extension ``.npz`` or ``.fits``.
+
+        Raises
+        ------
+        FileError
+            When the extension is another, or the file cannot be written.
+        """
+        from foveasim.optics.psfs._formats import write
+
+        write(self, Path(path))
+
+    @property
+    def description(self) -> str:
+        """Numbers of points, wavelengths and samples."""
+        n_points, n_waves, n_y, n_x = self.psf.shape
+        waves = f"{self.wavelength_nm[0]:g} nm" if n_waves == 1 else f"{n_waves} wavelengths"
+        points = "1 point" if n_points == 1 else f"{n_points} points"
+        return f"{points}, {waves}, {n_x} x {n_y} samples of {self.pitch_um:g} µm"
+
+    @property
+    def is_varying(self) -> bool:
+        """Whether there are PSFs at several points."""
+        return self.x_um.size > 1
+
+    @property
+    def is_radial(self) -> bool:
+        """Whether the points lie on one radius of a rotationally symmetric lens."""
+        return len(self.axes) == 1
+
+    @cached_property
+    def axes(self) -> tuple[Floats, ...]:
+        """Coordinates of the points, µm: none for one point, radii, or x and y of a grid."""
+        if self.x_um.size == 1:
+            return ()
+        extent_um = float(max(np.abs(self.x_um).max(), np.abs(self.y_um).max()))
+        radius_um = np.hypot(self.x_um, self.y_um)
+        far = int(radius_um.argmax())
+        along = (self.x_um * self.x_um[far] + self.y_um * self.y_um[far]) / radius_um[far]
+        if (np.abs(along - radius_um) <= SAME * extent_um).all():
+            return (np.sort(radius_um),)
+        axes = tuple(_distinct(at, SAME * extent_um) for at in (self.x_um, self.y_um))
+        n_x, n_y = (axis.size for axis in axes)
+        if n_x * n_y != self.x_um.size or n_x < 2 or n_y < 2:
+            raise ParameterError(
+                "x_um",
+                f"and 'y_um' must form a rectangular grid, or lie on one radius, got {self.x_um.size} points with {n_x} "
+                f"different x and {n_y} different y",
+                hint="add the missing points, or give those of one direction from the axis",
+            )
+        return axes
+
+    @cached_property
+    def order(self) -> Ints:
+        """Indices of the points by radius, or row by row of the grid."""
+        if len(self.axes) < 2:
+            return np.argsort(np.hypot(self.x_um, self.y_um))
+        column, row = (
+            np.abs(axis[:, np.newaxis] - at).argmin(axis=0)
+            for axis, at in zip(self.axes, (self.x_um, self.y_um), strict=True)
+        )
+        return np.lexsort((column, row))
+
+    @property
+    def azimuth_rad(self) -> float:
+        """Direction of the radius on which the points lie, from the x axis."""
+        far = int(self.order[-1])
+        return math.atan2(self.y_um[far], self.x_um[far])
+
+    @cached_property
+    def centroid_um(self) -> Floats:
+        """Centroids (x, y) relative to the image points, (n_point, n_wavelength, 2) µm."""
+        n_y, n_x = self.psf.shape[2:]
+        x_um, y_um = ((np.arange(n) - n // 2) * self.pitch_um for n in (n_x, n_y))
+        return np.stack(
+            (np.einsum("pwyx,x->pw", self.psf, x_um), np.einsum("pwyx,y->pw", self.psf, y_um)),
+            axis=-1,
+            dtype=np.float64,
+        )
+
+    @property
+    def beyond_fraction(self) -> Floats:
+        """
+        Estimated fraction of the light beyond the window, (n_point, n_wavelength).
+
+        The irradiance of a diffraction pattern decreases with the third power of the distance (edges of a pupil), as c / r³.
+        Its mean over the sides of a square of half side R is ``c / (√2 R³)``, and ``4 √2 c / R = 8 R²`` times this mean lies
+        beyond the square.
+        """
+        n_y, n_x = self.psf.shape[2:]
+        rows = self.psf, self.psf[..., ::-1, :], self.psf.swapaxes(2, 3), self.psf[..., ::-1].swapaxes(2, 3)
+        # One of the two outermost lines may be padding.
+        means = [each[..., :2, :].mean(axis=3, dtype=np.float64).max(axis=2) for each in rows]
+        beyond = 2.0 * n_y * n_x * np.maximum(np.mean(means, axis=0), 0.0)
+        return np.asarray(beyond / (1.0 + beyond))
+
+
+def _check_shape(
+    psf: NDArray[Any], x_um: Floats, y_um: Floats, wavelength_nm: Floats, *, is_padded: bool = True
+) -> None:
+    """Check that each point and wavelength has a PSF, and the limits of the size."""
+    rule = "(n_point, n_wavelength, n_y, n_x)"
+    if psf.ndim != 4 or 0 in psf.shape:
+        raise ParameterError("psf", f"must have the shape {rule}, got {psf.shape}")
+    if x_um.shape != (psf.shape[0],) or y_um.shape != x_um.shape:
+        raise ParameterError(
+            "x_um", f"and 'y_um' must have {psf.shape[0]} values, one per PSF, got {x_um.size} and {y_um.size}"
+        )
+    if wavelength_nm.shape != (psf.shape[1],):
+        raise ParameterError("wavelength_nm", f"must have {psf.shape[1]} values, one per PSF, got {wavelength_nm.size}")
+    if psf.size > MAX_VALUES or psf.shape[0] > MAX_POINTS or max(psf.shape[2:]) > MAX_SIDE:
+        raise ParameterError(
+            "psf",
+            f"must have at most {MAX_POINTS} points, {MAX_SIDE} samples along a side and {MAX_VALUES} values, "
+            f"got {psf.shape}",
+        )
+    if is_padded and (psf.shape[2] % 2 == 0 or psf.shape[3] % 2 == 0):
+        raise ParameterError(
+            "psf",
+            f"must have odd numbers of rows and columns, got {psf.shape[2:]}",
+            hint="use PSFGrid.from_arrays, which knows the centre of others",
+        )
+
+
+def _check_apart(x_um: Floats, y_um: Floats) -> None:
+    """Check that no two points coincide."""
+    from scipy.spatial import KDTree
+
+    points = np.column_stack((x_um, y_um))
+    pairs = KDTree(points).query_pairs(SAME * float(np.abs(points).max()))
+    if pairs:
+        one, other = min(pairs)
+        raise ParameterError(
+            "x_um",
+            f"and 'y_um' must be different for all points, got ({x_um[one]:g}, {y_um[one]:g}) µm at [{one}] and [{other}]",
+        )
+
+
+def _normalised(psf: NDArray[Any], real: Any, x_um: Floats, y_um: Floats, wavelength_nm: Floats) -> NDArray[Any]:
+    """Return PSFs of unit sum; raise a ParameterError that names the first invalid one."""
+    sums = psf.sum(axis=(2, 3), dtype=np.float64)
+    for is_bad, rule in ((~np.isfinite(sums), "must be finite"), (sums <= 0.0, "must have a positive sum")):
+        if is_bad.any():
+            point, wave = np.argwhere(is_bad)[0]
+            raise ParameterError(
+                "psf",
+                f"{rule}, which that at ({x_um[point]:g}, {y_um[point]:g}) µm and {wavelength_nm[wave]:g} nm "
+                f"{'is not' if rule.endswith('finite') else 'does not'}",
+            )
+    # Those of a file or another object are normalised already, and remain the same.
+    is_one = np.abs(sums - 1.0) <= 8.0 * np.finfo(real).eps
+    return np.ascontiguousarray(psf / np.where(is_one, 1.0, sums)[:, :, np.newaxis, np.newaxis], real)
+
+
+def _centred(psf: NDArray[Any], centre: tuple[int, int] | None) -> NDArray[Any]:
+    """Return PSFs that are padded so that the image point is the middle sample."""
+    pads = []
+    for axis, n in enumerate(psf.shape[2:]):
+        at = n // 2 if centre is None else int(centre[axis])
+        if not 0 <= at < n:
+            raise ParameterError("centre", f"must be within the {psf.shape[2]} x {psf.shape[3]} samples", centre)
+        half = max(at, n - 1 - at)
+        pads.append((half - at, half - (n - 1 - at)))
+    return np.pad(psf, [(0, 0), (0, 0), *pads])
+
+
+def _distinct(values: Floats, tolerance: float) -> Floats:
+    """Return ascending values that differ by more than a tolerance."""
+    ascending = np.sort(values)
+    return ascending[np.concatenate(([True], np.diff(ascending) > tolerance))]

@@ -1,0 +1,274 @@
+"""
+PSFs in text exports of Zemax OpticStudio, of its FFT and Huygens methods.
+
+A file contains the PSF of one field point and one wavelength. An index in YAML lists the files of a lens::
+
+    image: inverted      # positions in the projected image, as in OpticStudio (the default)
+    psfs:
+      - {file: axis_550.txt, x_um: 0.0, y_um: 0.0, wavelength_nm: 550.0}
+      - {file: edge_550.txt, x_um: 0.0, y_um: 1800.0, wavelength_nm: 550.0, relative_illumination: 0.82}
+
+The first row of a listing is that of the largest y, and the centre is that of its header.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from foveasim._core.validation import Floats
+from foveasim._io.formats import FileFormat, FormatError, as_file_error
+from foveasim._io.text_files import read_text
+from foveasim._io.yaml_files import MAX_FILE_BYTES as MAX_INDEX_BYTES
+from foveasim._io.yaml_files import parse_yaml
+from foveasim.errors import FileError
+from foveasim.optics.psfs._formats import PSF_FORMATS, choices_of, require
+from foveasim.optics.psfs._grid import MAX_POINTS, MAX_SIDE, PSFGrid
+
+TITLE = re.compile(r"\s*Listing of (FFT|Huygens) PSF Data")
+#: Largest size of a listing: 4096 x 4096 values of 16 characters in UTF-16.
+MAX_BYTES = 2**29
+#: Lengths in µm of the units of listings; "µ" in the encodings of OpticStudio.
+UNITS_UM = {"µm": 1.0, "μm": 1.0, "um": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
+NUMBER = r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
+WAVES = re.compile(rf"{NUMBER}(?:\s+to\s+{NUMBER})?\s*(\S+)\s+at\s")
+SPACING = re.compile(rf"Data spacing is\s+{NUMBER}\s*(\S+)")
+SIZE = re.compile(r"Image grid size:\s*(\d+)\s*by\s*(\d+)")
+CENTRE = re.compile(r"Center point is:\s*row\s*(\d+),\s*column\s*(\d+)")
+#: Relative tolerance of wavelengths and distances of samples, which listings round.
+SAME = 1e-3
+KEYS = ("file", "x_um", "y_um", "wavelength_nm")
+INDEX_KEYS = ("psfs", "image", "first_row", "samples")
+
+
+class Listing(NamedTuple):
+    """PSF of one point and wavelength, values (n_y, n_x); centre (row, column) or None."""
+
+    values: Floats
+    wavelength_nm: float
+    pitch_um: float
+    centre: tuple[int, int] | None
+
+
+def read_listing(path: Path) -> Listing:
+    """Read a text export; FormatErrors say what is missing."""
+    lines = _text(path).splitlines()
+    if not lines or not TITLE.match(lines[0]):
+        raise FormatError("is not a listing of an FFT or Huygens PSF of Zemax OpticStudio")
+    header = next((k for k, line in enumerate(lines) if line.lstrip().startswith("Values are")), None)
+    if header is None:
+        raise FormatError("has no line 'Values are ...', after which the values begin")
+    text = "\n".join(lines[:header])
+    waves, spacing, size = (
+        _find(pattern, text, what)
+        for pattern, what in ((WAVES, "wavelength"), (SPACING, "'Data spacing is'"), (SIZE, "'Image grid size'"))
+    )
+    low, high = float(waves[1]), float(waves[2] or waves[1])
+    if abs(high - low) > SAME * low:
+        raise FormatError(f"is the PSF of {low:g} to {high:g} {waves[3]}; export one wavelength per file")
+    n_x, n_y = int(size[1]), int(size[2])
+    if max(n_x, n_y) > MAX_SIDE:
+        raise FormatError(f"has {n_x} by {n_y} values, more than the limit of {MAX_SIDE} along a side")
+    words = " ".join(lines[header + 1 :]).split()
+    if len(words) != n_x * n_y:
+        raise FormatError(f"has {len(words)} values, expected {n_x} by {n_y} = {n_x * n_y}")
+    try:
+        values = np.array(words, np.float64).reshape(n_y, n_x)
+    except ValueError as error:
+        raise FormatError(f"has a value that is not a number ({error})") from None
+    centre = CENTRE.search(text)
+    return Listing(
+        values,
+        1e3 * low * _unit_um(waves[3]),
+        float(spacing[1]) * _unit_um(spacing[2]),
+        (int(centre[1]) - 1, int(centre[2]) - 1) if centre else None,
+    )
+
+
+def _text(path: Path) -> str:
+    """Return the text of a listing, in UTF-16, UTF-8 or Windows-1252."""
+    if path.stat().st_size > MAX_BYTES:
+        raise FormatError(f"must have at most {MAX_BYTES} bytes")
+    content = path.read_bytes()
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return content.decode("utf-16")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252")
+
+
+def _find(pattern: re.Pattern[str], text: str, what: str) -> re.Match[str]:
+    found = pattern.search(text)
+    if found is None:
+        raise FormatError(f"has no {what} in its header")
+    return found
+
+
+def _unit_um(name: str) -> float:
+    unit = name.rstrip(".,:;")
+    if unit not in UNITS_UM:
+        raise FormatError(f"has the unit of length {unit!r:.20}, expected {', '.join(UNITS_UM)}")
+    return UNITS_UM[unit]
+
+
+def read_one(path: Path) -> PSFGrid:
+    """Read one listing, whose PSF is that of the whole field."""
+    one = read_listing(path)
+    return PSFGrid.from_arrays(
+        one.values,
+        x_um=0.0,
+        y_um=0.0,
+        wavelength_nm=one.wavelength_nm,
+        pitch_um=one.pitch_um,
+        image="inverted",
+        first_row="highest",
+        centre=one.centre,
+    )
+
+
+def read_index(path: Path) -> PSFGrid:
+    """Read an index and its listings."""
+    about = parse_yaml(path, read_text(path, "an index of PSFs", MAX_INDEX_BYTES))
+    entries = _entries(about)
+    points = list(dict.fromkeys((entry["x_um"], entry["y_um"]) for entry in entries))
+    waves_nm = sorted({entry["wavelength_nm"] for entry in entries})
+    stack: Any = None
+    known: dict[tuple[int, int], str] = {}
+    fraction = np.ones((len(points), len(waves_nm)))
+    first: Listing | None = None
+    for entry in entries:
+        file = path.parent / entry["file"]
+        if not file.is_file():
+            raise FormatError(f"lists {entry['file']!r:.80}, which does not exist")
+        with as_file_error(file, "listing of a PSF", passes=(FileError,)):
+            one = read_listing(file)
+            if abs(one.wavelength_nm - entry["wavelength_nm"]) > SAME * one.wavelength_nm:
+                raise FormatError(
+                    f"is the PSF at {one.wavelength_nm:g} nm, but {path.name} lists it for {entry['wavelength_nm']:g} nm"
+                )
+            first = one if first is None else first
+            if one.values.shape != first.values.shape or one.centre != first.centre:
+                raise FormatError(
+                    f"has {one.values.shape} values with the centre {one.centre}, expected {first.values.shape} with "
+                    f"{first.centre} as in {entries[0]['file']!r:.80}"
+                )
+            if abs(one.pitch_um - first.pitch_um) > SAME * first.pitch_um:
+                raise FormatError(
+                    f"has samples of {one.pitch_um:g} µm, expected {first.pitch_um:g} µm as in {entries[0]['file']!r:.80}; "
+                    "set the same 'image delta', or resample it"
+                )
+        if stack is None:
+            stack = np.full((len(points), len(waves_nm), *first.values.shape), np.nan)
+        at = points.index((entry["x_um"], entry["y_um"])), waves_nm.index(entry["wavelength_nm"])
+        if at in known:
+            raise FormatError(
+                f"lists {known[at]!r:.80} and {entry['file']!r:.80} for the same point and wavelength; remove one of them"
+            )
+        known[at], stack[at] = entry["file"], one.values
+        fraction[at] = entry.get("relative_illumination", 1.0)
+    for p, (x_um, y_um) in enumerate(points):
+        for w, wave_nm in enumerate(waves_nm):
+            if (p, w) not in known:
+                raise FormatError(
+                    f"lists no PSF at ({x_um:g}, {y_um:g}) µm and {wave_nm:g} nm, a wavelength of other points; add it"
+                )
+    assert first is not None
+    has_illumination = any("relative_illumination" in entry for entry in entries)
+    x_um, y_um = np.array(points).T
+    conventions = {"image": "inverted", "first_row": "highest", **choices_of(about)}
+    return PSFGrid.from_arrays(
+        stack,
+        x_um=x_um,
+        y_um=y_um,
+        wavelength_nm=waves_nm,
+        pitch_um=first.pitch_um,
+        centre=first.centre,
+        relative_illumination=fraction if has_illumination else None,
+        **conventions,
+    )
+
+
+def _entries(about: Any) -> list[dict[str, Any]]:
+    """Return the checked entries of an index."""
+    if not isinstance(about, Mapping) or not isinstance(about.get("psfs"), list) or not about["psfs"]:
+        raise FormatError("must have a list 'psfs' of entries with the keys " + ", ".join(KEYS))
+    unknown = sorted(set(about) - set(INDEX_KEYS))
+    if unknown:
+        raise FormatError(f"has the unknown key {unknown[0]!r:.40}; expected {', '.join(INDEX_KEYS)}")
+    if len(about["psfs"]) > MAX_POINTS:
+        raise FormatError(f"lists {len(about['psfs'])} files, more than {MAX_POINTS}")
+    found = []
+    for number, entry in enumerate(about["psfs"]):
+        if not isinstance(entry, Mapping):
+            raise FormatError(f"must have the keys {', '.join(KEYS)} in psfs[{number}]")
+        require(entry, KEYS)
+        unknown = sorted(set(entry) - {*KEYS, "relative_illumination"})
+        if unknown:
+            raise FormatError(f"has the unknown key {unknown[0]!r:.40} in psfs[{number}]")
+        numbers = {name: value for name, value in entry.items() if name != "file"}
+        for name, value in numbers.items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+                raise FormatError(f"must have a finite number as '{name}' in psfs[{number}], got {value!r:.40}")
+        if not isinstance(entry["file"], str):
+            raise FormatError(f"must have the name of a file as 'file' in psfs[{number}], got {entry['file']!r:.40}")
+        found.append({"file": entry["file"], **{name: float(value) for name, value in numbers.items()}})
+    return found
+
+
+def _is_listing(path: Path, head: bytes) -> bool:
+    text = head.replace(b"\x00", b"").lstrip(b"\xff\xfe\xef\xbb\xbf")
+    return path.is_file() and TITLE.match(text.decode("latin-1")) is not None
+
+
+def _is_index(path: Path, head: bytes) -> bool:  # noqa: ARG001 -- the signature is that of formats
+    return path.suffix.lower() in (".yaml", ".yml")
+
+
+def write_example(path: Path, values: Floats, wavelength_nm: float) -> None:
+    """Write a listing as OpticStudio does, with samples of 0.5 µm, largest y first."""
+    n_y, n_x = values.shape
+    rows = "\n".join("\t".join(f"{value:.8E}" for value in row) for row in values)
+    header = (
+        f"Listing of FFT PSF Data\n\nPolychromatic FFT PSF\n{1e-3 * wavelength_nm:.4f} to {1e-3 * wavelength_nm:.4f} µm at "
+        f"0.0000, 0.0000 (deg).\nData spacing is 0.500 µm.\nData area is {0.5 * n_x:.3f} µm wide.\nSurface: Image\n"
+        f"Pupil grid size: {n_x // 2} by {n_y // 2}\nImage grid size: {n_x} by {n_y}\n"
+        f"Center point is: row {n_y // 2 + 1}, column {n_x // 2}\nValues are not normalized.\n\n"
+    )
+    path.write_text(header + rows + "\n", encoding="utf-16")
+
+
+def _example(path: Path) -> PSFGrid:
+    values = np.pad(np.arange(1.0, 17.0).reshape(4, 4), 2)
+    write_example(path, values, 550.0)
+    # Turned by 180° into the upright picture, with the lowest row first: columns are reversed.
+    return PSFGrid.from_arrays(values[:, ::-1], x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=0.5, centre=(4, 4))
+
+
+def _example_index(path: Path) -> PSFGrid:
+    entries, found = [], []
+    for k in range(2):
+        values = np.zeros((8, 8))
+        values[2 + k : 5, 2:6] = np.arange(1.0, 5.0)
+        write_example(path.with_name(f"point_{k}.txt"), values, 550.0)
+        entries.append(f"  - {{file: point_{k}.txt, x_um: 0.0, y_um: {500.0 * k}, wavelength_nm: 550.0}}\n")
+        found.append(values[:, ::-1])
+    path.write_text("psfs:\n" + "".join(entries), encoding="utf-8")
+    y_um = [0.0, -500.0]
+    return PSFGrid.from_arrays(found, x_um=[0.0, 0.0], y_um=y_um, wavelength_nm=550.0, pitch_um=0.5, centre=(4, 4))
+
+
+PSF_FORMATS.register(
+    "zemax",
+    FileFormat(title="Zemax listing", suffixes=(".txt",), matches=_is_listing, read=read_one),
+    example=_example,
+)
+PSF_FORMATS.register(
+    "zemax_index",
+    FileFormat(title="index of Zemax listings", suffixes=(".yaml", ".yml"), matches=_is_index, read=read_index),
+    example=_example_index,
+)
