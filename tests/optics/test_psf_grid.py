@@ -327,10 +327,10 @@ def test_relative_illumination_of_one_is_none():
     found = with_psfs(ones).power_map(scene).data
 
     np.testing.assert_array_equal(found, with_psfs(psfs, relative_illumination=table).power_map(scene).data)
-    # A scene at a distance that makes the cosine 1.
-    far = replace(scene, pitch_um=1e6 * 100.0, distance_m=1e6)
-    lenses = [with_psfs(each, focus_distance_m=1.0) for each in (psfs, ones)]
-    np.testing.assert_allclose(*[each.power_map(far).data for each in lenses], rtol=1e-6)
+    # The field is small, so that the cosine of the lens is close to 1.
+    cosine = with_psfs(psfs).power_map(scene).data
+    assert (cosine < found).all()
+    np.testing.assert_allclose(cosine, found, rtol=1e-4)
 
 
 def test_table_of_the_cosine_law_gives_it():
