@@ -35,6 +35,8 @@ ACROSS_PER_BLUR = 16
 MAX_ACROSS = 2048
 #: Points across the aperture at which pupil callables are evaluated; odd, so that edges at simple fractions lie between points.
 PUPIL_POINTS = 1535
+#: Largest number of cached samples of a pupil: the wavelengths of a picture.
+MAX_CACHED_MEANS = 4
 #: Points across the aperture at which the wavefront slope is evaluated.
 SLOPE_POINTS = 193
 #: Frequencies of the quadrature in radians per radius: the first beyond the geometric blur, the factor between attempts, and
@@ -338,13 +340,16 @@ class Aperture:
     def _mean_pupil(self, wavelength_nm: float, n_across: float) -> NDArray[Any]:
         """Return the amplitudes of the pupil, averaged over the squares around the samples."""
         key = 0.0 if self.is_achromatic else wavelength_nm, n_across
-        known = self._cache.get("mean")
-        if known is None or known[0] != key:
+        known: dict[Any, NDArray[Any]] = self._cache.get("mean", {})
+        found = known.get(key)
+        if found is None:
             n = math.ceil(n_across)
             fine = self._sample_pupil(wavelength_nm, max(PUPIL_POINTS, n))
             mean = overlaps(n, 2.0 / n_across, fine.shape[0], 2.0 / fine.shape[0])
-            known = self._cache["mean"] = key, (mean @ (mean @ fine).T).T
-        return np.asarray(known[1])
+            found = (mean @ (mean @ fine).T).T
+            # The most recent ones, in another object, since threads read it.
+            self._cache["mean"] = dict([*known.items(), (key, found)][-MAX_CACHED_MEANS:])
+        return found
 
     def sampled_psf(
         self, wavelength_nm: float, n_across: int, radius: int, field_um: tuple[float, float], real: Any

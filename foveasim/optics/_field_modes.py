@@ -24,14 +24,17 @@ from foveasim._core.validation import Floats
 from foveasim.fields import Grid
 from foveasim.optics._aperture import PSFModel
 
-#: Points along each side of the picture at which PSFs are computed.
-FIELD_POINTS = 9
+#: Points along each side of the picture at which PSFs are computed: the first number that reaches the tolerance.
+FIELD_POINTS = (9, 17)
 #: Radius beyond the geometric blur, in λN, in which PSFs are compared: all but 1 % of the power of a clear circle.
 REACH_LAMBDA_N = 20.0
 #: Largest number of wavelengths whose PSFs determine the modes.
 MAX_WAVELENGTHS = 3
-#: Largest number of samples of all PSFs, 1 GiB in single precision: more wavelengths than one are omitted beyond it.
-MAX_SAMPLES = 1 << 28
+#: Largest number of samples of all PSFs, 1 GiB in single precision: more wavelengths than one, and more points, are omitted
+#: beyond it. Up to the second number, they are in double precision.
+MAX_SAMPLES, MAX_DOUBLE_SAMPLES = 1 << 28, 1 << 22
+#: Largest number of samples across the aperture, a blur of 24 λN, for more points: some 10 s.
+MAX_ACROSS = 384
 #: If the tolerance cannot be reached, the modes displace this multiple of the least possible.
 UNREACHED = 1.1
 #: Samples whose products are computed in double precision together.
@@ -124,19 +127,41 @@ def find_modes(
     tolerance: float,
     n_modes: int | None,
     n_threads: int,
-    n_points: int = FIELD_POINTS,
 ) -> FieldModes:
     """
     Return the modes of the PSFs over the field of a picture.
 
     ``n_modes``: number without the mean; by default the smallest with which at most the fraction ``tolerance`` of the light is
-    displaced: half the L1 norm of the difference of the PSFs, at the points and midway between them.
+    displaced: half the L1 norm of the difference of the PSFs, at the points and midway between them. There are more points if
+    the fraction cannot be reached otherwise.
     """
+    sampling = Sampling.of(aperture, field_points_um(grid, FIELD_POINTS[0]).reshape(-1, 2), wavelength_nm)
+    found: FieldModes | None = None
+    for n_points in FIELD_POINTS:
+        is_affordable = sampling.n_across <= MAX_ACROSS and 2 * n_points * n_points * sampling.n_samples <= MAX_SAMPLES
+        if found is None or is_affordable:
+            found = _modes_at(aperture, grid, sampling, n_points, tolerance, n_modes, n_threads)
+        if n_modes is not None or found.displaced <= tolerance:
+            break
+    assert found is not None
+    return found
+
+
+def _modes_at(
+    aperture: PSFModel,
+    grid: Grid,
+    sampling: Sampling,
+    n_points: int,
+    tolerance: float,
+    n_modes: int | None,
+    n_threads: int,
+) -> FieldModes:
+    """Return the modes of the PSFs at n x n points of a picture."""
     every_um = field_points_um(grid, 2 * n_points - 1)
     is_point, is_midway = (np.zeros(every_um.shape[:2], bool) for _ in range(2))
     is_point[::2, ::2], is_midway[1::2, 1::2] = True, True
     used = is_point | is_midway
-    psfs = sampled_psfs(aperture, every_um[used], wavelength_nm, n_threads)
+    psfs = sampled_psfs(aperture, every_um[used], sampling, n_threads)
     of_point = is_point[used]
     psfs -= psfs[of_point].mean(axis=0)
     at_points = psfs[of_point].reshape(n_points * n_points, -1)
@@ -212,28 +237,48 @@ def _number_of_modes(
     return n_most, displaced
 
 
-def sampled_psfs(
-    aperture: PSFModel, points_um: Floats, wavelength_nm: Floats, n_threads: int, real: Any = np.float32
-) -> NDArray[Any]:
+@dataclass(frozen=True)
+class Sampling:
     """
-    Return samples of the PSFs at points of the field, at multiples of λN/2.
+    Samples of PSFs at multiples of λN/2, in a square that contains the geometric blur.
 
-    (n_point, n_wavelength, n_sample): at the shortest, a middle and the longest wavelength, in a square that contains the
-    geometric blur of all points.
+    ``wavelength_nm``: the shortest, a middle and the longest wavelength. ``radius``: multiples on each side of the centre.
     """
+
+    wavelength_nm: tuple[float, ...]
+    n_across: int
+    radius: int
+
+    @classmethod
+    def of(cls, aperture: PSFModel, points_um: Floats, wavelength_nm: Floats) -> Sampling:
+        """Return the samples for points of the field, (n, 2)."""
+        points = [(float(x_um), float(y_um)) for x_um, y_um in points_um]
+        waves_nm = np.unique(wavelength_nm)
+        blur = max(aperture.blur_lambda_n(float(wave_nm), point) for wave_nm in waves_nm for point in points)
+        n_across = max(aperture.n_across(float(wave_nm), point) for wave_nm in waves_nm for point in points)
+        radius = min(math.ceil(2.0 * (blur + REACH_LAMBDA_N)), n_across - 1)
+        # At the points and midway between them.
+        n_waves = max(1, min(waves_nm.size, MAX_WAVELENGTHS, MAX_SAMPLES // (2 * (2 * radius + 1) ** 2 * len(points))))
+        if n_waves > 1:
+            waves_nm = waves_nm[np.linspace(0, waves_nm.size - 1, n_waves).round().astype(int)]
+        return cls(tuple(waves_nm[:n_waves].tolist()), n_across, radius)
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples per point, at all wavelengths."""
+        return len(self.wavelength_nm) * (2 * self.radius + 1) ** 2
+
+
+def sampled_psfs(aperture: PSFModel, points_um: Floats, sampling: Sampling, n_threads: int) -> NDArray[Any]:
+    """Return samples of the PSFs at points of the field, (n_point, n_wavelength, n_sample)."""
     points = [(float(x_um), float(y_um)) for x_um, y_um in points_um]
-    waves_nm = np.unique(wavelength_nm)
-    blur = max(aperture.blur_lambda_n(float(wave_nm), point) for wave_nm in waves_nm for point in points)
-    n_across = max(aperture.n_across(float(wave_nm), point) for wave_nm in waves_nm for point in points)
-    radius = min(math.ceil(2.0 * (blur + REACH_LAMBDA_N)), n_across - 1)
-    n_samples = (2 * radius + 1) ** 2
-    n_waves = max(1, min(waves_nm.size, MAX_WAVELENGTHS, MAX_SAMPLES // (n_samples * len(points))))
-    waves_nm = waves_nm[np.linspace(0, waves_nm.size - 1, n_waves).round().astype(int)] if n_waves > 1 else waves_nm[:1]
-    psfs = np.empty((len(points), n_waves, n_samples), real)
-    for w, wave_nm in enumerate(waves_nm):
+    n_waves = len(sampling.wavelength_nm)
+    real: Any = np.float64 if len(points) * sampling.n_samples <= MAX_DOUBLE_SAMPLES else np.float32
+    psfs = np.empty((len(points), n_waves, sampling.n_samples // n_waves), real)
+    for w, wave_nm in enumerate(sampling.wavelength_nm):
 
-        def compute(k: int, w: int = w, wave_nm: float = float(wave_nm)) -> None:
-            psfs[k, w] = aperture.sampled_psf(wave_nm, n_across, radius, points[k], real).ravel()
+        def compute(k: int, w: int = w, wave_nm: float = wave_nm) -> None:
+            psfs[k, w] = aperture.sampled_psf(wave_nm, sampling.n_across, sampling.radius, points[k], real).ravel()
 
         compute(0)  # samples the pupil, which all points share
         parallel_map(compute, range(1, len(points)), n_threads)

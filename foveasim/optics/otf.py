@@ -24,8 +24,10 @@ MAX_ALIASES = 128
 TABLE_POINTS: dict[Any, int] = {np.float32: 1 << 13, np.float64: 1 << 15}
 #: The OTF at one point of the field.
 ONE_POINT = np.ones((1, 1))
-#: Points of the field whose OTFs are computed in threads together.
-POINTS_TOGETHER = 8
+#: Largest number of points of the field whose OTFs are added together.
+POINTS_TOGETHER = 32
+#: Sums to which tables of points are added together.
+SUMS_TOGETHER = 16
 #: Largest number of cached apertures, and of modes over the field, one per scene distance.
 MAX_CACHED_APERTURES = 4
 #: Memory limit of the tables of all wavelengths, in numbers (128 MiB); beyond it, their step increases.
@@ -157,16 +159,31 @@ class PlaneTables:
         which = which.reshape(of_mode.shape[:2])
         parts = np.stack([(which == k) @ self._combinations for k in range(len(spectra))], axis=1)
         sums = np.zeros((len(weights), *(2 * self._n_lags + 1,) * 2), np.result_type(self._real, np.complex64))
-        n_points, n_together = len(self._points_um), POINTS_TOGETHER if self._aperture.is_achromatic else 1
+        n_points, n_numbers = len(self._points_um), len(spectra) * sums[0].size
+        n_together = max(1, min(POINTS_TOGETHER, MAX_TABLE_SIZE // n_numbers))
         for first in range(0, n_points, n_together):
             at = range(first, min(first + n_together, n_points))
-            n_threads = self._n_threads if first else 1  # the first call samples the pupil, which all points share
-            found = parallel_map(lambda point: self._at_point(point, spectra), at, n_threads)
-            for p, tables in zip(at, found, strict=True):
-                for i, k in zip(*np.nonzero(parts[:, :, p]), strict=True):
-                    if tables[k] is not None:
-                        sums[i] += tables[k] if parts[i, k, p] == 1.0 else self._real(parts[i, k, p]) * tables[k]
+            # The first call samples the pupil, which all points share, at each wavelength if it is chromatic.
+            found = [self._at_point(point, spectra) for point in at[: 1 if first == 0 else 0]]
+            n_threads = self._n_threads if self._aperture.is_achromatic else 1
+            found += parallel_map(lambda point: self._at_point(point, spectra), at[len(found) :], n_threads)
+            for k in range(len(spectra)):
+                tables = [each[k] for each in found]
+                if tables[0] is not None:
+                    self._add(sums, parts[:, k, at.start : at.stop], tables)
         self._cache |= {weight.tobytes(): total for weight, total in zip(weights, sums, strict=True)}
+
+    def _add(self, sums: NDArray[Any], weights: Floats, tables: Sequence[NDArray[Any] | None]) -> None:
+        """Add ``weights @ tables`` to sums, of one point or of several."""
+        if weights.shape == (1, 1) and weights[0, 0] == 1.0:
+            sums[0] += tables[0]
+            return
+        used = np.flatnonzero(weights.any(axis=1))
+        flat = np.stack([each for each in tables if each is not None]).view(self._real).reshape(len(tables), -1)
+        weights = weights[used].astype(self._real)
+        for first in range(0, used.size, SUMS_TOGETHER):
+            some = slice(first, first + SUMS_TOGETHER)
+            sums[used[some]] += (weights[some] @ flat).view(sums.dtype).reshape(-1, *sums.shape[1:])
 
     def _at_point(self, point: int, spectra: Floats) -> list[NDArray[Any] | None]:
         """Return the OTF of each sum over wavelengths at a point, None for no wavelength."""

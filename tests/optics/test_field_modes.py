@@ -11,7 +11,7 @@ import pytest
 import foveasim as fs
 from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.optics import LateralColour, Seidel, _field_modes
-from foveasim.optics._field_modes import find_modes, sampled_psfs
+from foveasim.optics._field_modes import Sampling, find_modes, sampled_psfs
 
 pytestmark = pytest.mark.filterwarnings("ignore:the image of the scene is only")
 WAVES_NM = np.array([500.0, 600.0])
@@ -94,13 +94,14 @@ def test_modes_are_singular_vectors_of_psfs():
     aperture, grid = LENS.aperture(scene), LENS.grid(scene)
     for k in (0, 2, 5, 11):
         modes = find_modes(aperture, grid, scene.wavelength_nm, tolerance=1.0, n_modes=k, n_threads=1)
-        psfs = sampled_psfs(aperture, modes.points_um, scene.wavelength_nm, 1, np.float64)[:, 0]
+        sampling = Sampling.of(aperture, modes.points_um, scene.wavelength_nm)
+        psfs = sampled_psfs(aperture, modes.points_um, sampling, 1)[:, 0]
         sampled = modes.combinations @ psfs
         found = modes.at_points.reshape(k + 1, -1).T @ sampled
 
         error = np.sqrt(np.square(psfs - found).sum())
         expected = np.sqrt(np.square(modes.singular_values[k:]).sum())
-        assert error == pytest.approx(expected, rel=2e-4)  # the modes are from PSFs in single precision
+        assert error == pytest.approx(expected, rel=1e-10)
         np.testing.assert_allclose(modes.combinations[1:].sum(axis=1), 0.0, atol=1e-14)
         assert modes.combinations[0].sum() == pytest.approx(1.0, rel=1e-14)
 
@@ -151,6 +152,19 @@ def test_unreachable_tolerance_causes_warning():
         SamplingWarning, match=r"modes displace 0\.\d+ of the light of a point, more than field_tolerance"
     ):
         strong.power_map(noise(n=16))
+
+
+@pytest.mark.slow
+def test_more_points_reach_the_tolerance():
+    strong = Seidel(coma_um=0.48, astigmatism_um=0.36, field_curvature_um=0.3, field_radius_um=30.0)
+    lens, scene = replace(LENS, seidel=strong), noise()
+    modes = find_modes(
+        lens.aperture(scene), lens.grid(scene), scene.wavelength_nm, tolerance=0.01, n_modes=None, n_threads=2
+    )
+
+    assert modes.points_um.shape == (17 * 17, 2)
+    assert lens.field_error(scene) == pytest.approx(modes.displaced, rel=1e-6)
+    assert modes.displaced <= 0.01
 
 
 def test_equal_psfs_need_no_modes():

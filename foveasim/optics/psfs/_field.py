@@ -62,8 +62,8 @@ class FieldPSFs:
 
     @property
     def is_achromatic(self) -> bool:
-        """Whether PSFs at all wavelengths share samples of a pupil, which is not the case."""
-        return False
+        """Whether no samples of a pupil depend on the wavelength: there are none."""
+        return True
 
     @property
     def is_clear_circle(self) -> bool:

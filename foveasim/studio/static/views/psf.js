@@ -1,0 +1,5 @@
+// Sections of the point spread function of the lens at photosites.
+
+import { curveView } from "../charts.js";
+
+export const create = curveView({ nameX: "distance from the image point", nameY: "point spread", label: "Point spread" });
