@@ -13,7 +13,7 @@ of shift-variant blur, Int. J. Comput. Vis. 115, 253 (2015).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from foveasim._core.threads import parallel_map
 from foveasim._core.validation import Floats
 from foveasim.fields import Grid
-from foveasim.optics._aperture import PSFModel
+from foveasim.optics._aperture import PSFModel, overlaps
 
 #: Points along each side of the picture at which PSFs are computed: the first number that reaches the tolerance.
 FIELD_POINTS = (9, 17)
@@ -123,19 +123,21 @@ def find_modes(
     aperture: PSFModel,
     grid: Grid,
     wavelength_nm: Floats,
+    lambda_n_um: Floats,
     *,
     tolerance: float,
     n_modes: int | None,
     n_threads: int,
 ) -> FieldModes:
     """
-    Return the modes of the PSFs over the field of a picture.
+    Return the modes of the PSFs over the field of a picture, a grid of map cells.
 
     ``n_modes``: number without the mean; by default the smallest with which at most the fraction ``tolerance`` of the light is
-    displaced: half the L1 norm of the difference of the PSFs, at the points and midway between them. There are more points if
-    the fraction cannot be reached otherwise.
+    displaced: half the L1 norm of the difference of the PSFs, in cells if these are wider than λN/2, at the points and midway
+    between them. There are more points if the fraction cannot be reached otherwise.
     """
-    sampling = Sampling.of(aperture, field_points_um(grid, FIELD_POINTS[0]).reshape(-1, 2), wavelength_nm)
+    first_um = field_points_um(grid, FIELD_POINTS[0]).reshape(-1, 2)
+    sampling = Sampling.of(aperture, first_um, wavelength_nm, lambda_n_um, grid.pitch_x_um)
     found: FieldModes | None = None
     for n_points in FIELD_POINTS:
         is_affordable = sampling.n_across <= MAX_ACROSS and 2 * n_points * n_points * sampling.n_samples <= MAX_SAMPLES
@@ -240,33 +242,57 @@ def _number_of_modes(
 @dataclass(frozen=True)
 class Sampling:
     """
-    Samples of PSFs at multiples of λN/2, in a square that contains the geometric blur.
+    Samples of PSFs at multiples of λN/2, or sums over cells that are wider.
 
-    ``wavelength_nm``: the shortest, a middle and the longest wavelength. ``radius``: multiples on each side of the centre.
+    They are in a square that contains the geometric blur. ``wavelength_nm``, ``lambda_n_um``: of the shortest, a middle and
+    the longest wavelength. ``radius``: multiples on each side of the centre. ``cell_um``: width of the cells of a map, which
+    does not resolve how light is distributed within them.
     """
 
     wavelength_nm: tuple[float, ...]
+    lambda_n_um: tuple[float, ...]
     n_across: int
     radius: int
+    cell_um: float
 
     @classmethod
-    def of(cls, aperture: PSFModel, points_um: Floats, wavelength_nm: Floats) -> Sampling:
+    def of(
+        cls, aperture: PSFModel, points_um: Floats, wavelength_nm: Floats, lambda_n_um: Floats, cell_um: float
+    ) -> Sampling:
         """Return the samples for points of the field, (n, 2)."""
         points = [(float(x_um), float(y_um)) for x_um, y_um in points_um]
-        waves_nm = np.unique(wavelength_nm)
+        waves_nm, which = np.unique(wavelength_nm, return_index=True)
         blur = max(aperture.blur_lambda_n(float(wave_nm), point) for wave_nm in waves_nm for point in points)
         n_across = max(aperture.n_across(float(wave_nm), point) for wave_nm in waves_nm for point in points)
         radius = min(math.ceil(2.0 * (blur + REACH_LAMBDA_N)), n_across - 1)
+        one = cls((0.0,), (float(lambda_n_um.max()),), n_across, radius, cell_um)
         # At the points and midway between them.
-        n_waves = max(1, min(waves_nm.size, MAX_WAVELENGTHS, MAX_SAMPLES // (2 * (2 * radius + 1) ** 2 * len(points))))
-        if n_waves > 1:
-            waves_nm = waves_nm[np.linspace(0, waves_nm.size - 1, n_waves).round().astype(int)]
-        return cls(tuple(waves_nm[:n_waves].tolist()), n_across, radius)
+        n_waves = max(1, min(waves_nm.size, MAX_WAVELENGTHS, MAX_SAMPLES // (2 * one.n_samples * len(points))))
+        chosen = np.linspace(0, waves_nm.size - 1, n_waves).round().astype(int) if n_waves > 1 else np.zeros(1, int)
+        return replace(
+            one, wavelength_nm=tuple(waves_nm[chosen].tolist()), lambda_n_um=tuple(lambda_n_um[which[chosen]].tolist())
+        )
+
+    @property
+    def n_side(self) -> int:
+        """Number of samples or cells along a side."""
+        widest_um = 0.5 * max(self.lambda_n_um)
+        if self.cell_um <= widest_um:
+            return 2 * self.radius + 1
+        return 2 * math.ceil((self.radius + 0.5) * widest_um / self.cell_um - 0.5) + 1
 
     @property
     def n_samples(self) -> int:
         """Number of samples per point, at all wavelengths."""
-        return len(self.wavelength_nm) * (2 * self.radius + 1) ** 2
+        return len(self.wavelength_nm) * self.n_side**2
+
+    def sums(self, psf: NDArray[Any], wave: int) -> NDArray[Any]:
+        """Return samples of a PSF, or their sums over cells."""
+        step_um = 0.5 * self.lambda_n_um[wave]
+        if self.cell_um <= 0.5 * max(self.lambda_n_um):
+            return psf
+        onto = overlaps(self.n_side, self.cell_um / step_um, psf.shape[0], 1.0) * (self.cell_um / step_um)
+        return np.asarray((onto @ (onto @ psf).T).T)
 
 
 def sampled_psfs(aperture: PSFModel, points_um: Floats, sampling: Sampling, n_threads: int) -> NDArray[Any]:
@@ -278,7 +304,8 @@ def sampled_psfs(aperture: PSFModel, points_um: Floats, sampling: Sampling, n_th
     for w, wave_nm in enumerate(sampling.wavelength_nm):
 
         def compute(k: int, w: int = w, wave_nm: float = wave_nm) -> None:
-            psfs[k, w] = aperture.sampled_psf(wave_nm, sampling.n_across, sampling.radius, points[k], real).ravel()
+            psf = aperture.sampled_psf(wave_nm, sampling.n_across, sampling.radius, points[k], real)
+            psfs[k, w] = sampling.sums(psf, w).ravel()
 
         compute(0)  # samples the pupil, which all points share
         parallel_map(compute, range(1, len(points)), n_threads)

@@ -128,7 +128,8 @@ class Optics(PointImages):
         Image size per wavelength. Outside a smaller image the power map is 0.
     field_tolerance : float
         Fraction of the light of a point that may be displaced where aberrations vary over the field: half the integral of the
-        absolute difference of the PSFs. The PSFs at 9 x 9 points of the picture are a sum of modes, whose number follows.
+        absolute difference of the PSFs, or of their sums over map cells wider than λN/2. The PSFs at 9 x 9 points of the
+        picture are a sum of modes, whose number follows.
     field_modes : "auto" or int
         Number of modes in addition to the mean PSF, instead of the tolerance.
     field_patches : int, optional
@@ -677,7 +678,7 @@ class Optics(PointImages):
         if illumination is not None:
             tangent2_x, tangent2_y = np.zeros_like(tangent2_x), np.zeros_like(tangent2_y)
         # Cache key: a factor depends on these, the lens and the weights.
-        place = None if modes is None else grid.bounds_um
+        place = None if modes is None else grid
         spectrum_key = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um, self._n_fine, place
 
         def cached_factor(weight: Floats, transform: Transform, table_of: Tables) -> Factor:
@@ -739,9 +740,9 @@ class Optics(PointImages):
         Return the largest fraction of the light of a point that is displaced.
 
         This is half the integral of the absolute difference between the PSF at a point of the field and that of the maps: of
-        modes, at the points that determine them and midway between these; of isoplanatic patches, midway between their centres,
-        where it decreases with the square of ``field_patches``. For a single patch, the corners of the picture are compared
-        with its centre.
+        modes, at the points that determine them and midway between these, where light that is displaced within a map cell wider
+        than λN/2 does not count; of isoplanatic patches, midway between their centres, where it decreases with the square of
+        ``field_patches``. For a single patch, the corners of the picture are compared with its centre.
 
         Parameters
         ----------
@@ -772,14 +773,15 @@ class Optics(PointImages):
         """Return the modes of the PSFs over a picture."""
         from foveasim.optics._field_modes import find_modes
 
-        grid, aperture = self.grid(scene), self._aperture(scene.distance_m)
+        grid, aperture = self._refine(self.grid(scene)), self._aperture(scene.distance_m)
         n_modes = None if self.field_modes == "auto" else self.field_modes
         found: FieldModes = self._cache.modes(
-            (scene.wavelength_nm.tobytes(), scene.distance_m, grid.bounds_um),
+            (scene.wavelength_nm.tobytes(), scene.distance_m, grid),
             lambda: find_modes(
                 aperture,
                 grid,
                 scene.wavelength_nm,
+                self._lambda_n_um(scene),
                 tolerance=self.field_tolerance,
                 n_modes=n_modes,
                 n_threads=n_threads,

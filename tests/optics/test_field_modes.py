@@ -31,6 +31,10 @@ def noise(n=48, n_basis=1, **options):
     return scene_of(np.random.default_rng(0).random((n_basis, n, n + 6)), **options)
 
 
+def lambda_n_um(scene):
+    return 1e-3 * scene.wavelength_nm * LENS.working_f_number(scene.distance_m)
+
+
 @pytest.fixture
 def linear(monkeypatch):
     """Weights that are linear between the points, as those of patches."""
@@ -92,9 +96,10 @@ def test_any_modes_conserve_power(padding, precision, tolerance):
 def test_modes_are_singular_vectors_of_psfs():
     scene = noise()
     aperture, grid = LENS.aperture(scene), LENS.grid(scene)
+    near_um = lambda_n_um(scene)
     for k in (0, 2, 5, 11):
-        modes = find_modes(aperture, grid, scene.wavelength_nm, tolerance=1.0, n_modes=k, n_threads=1)
-        sampling = Sampling.of(aperture, modes.points_um, scene.wavelength_nm)
+        modes = find_modes(aperture, grid, scene.wavelength_nm, near_um, tolerance=1.0, n_modes=k, n_threads=1)
+        sampling = Sampling.of(aperture, modes.points_um, scene.wavelength_nm, near_um, 0.0)
         psfs = sampled_psfs(aperture, modes.points_um, sampling, 1)[:, 0]
         sampled = modes.combinations @ psfs
         found = modes.at_points.reshape(k + 1, -1).T @ sampled
@@ -137,7 +142,13 @@ def test_fewer_modes_suffice_for_larger_tolerances():
     scene = noise()
     numbers = [
         find_modes(
-            LENS.aperture(scene), LENS.grid(scene), scene.wavelength_nm, tolerance=t, n_modes=None, n_threads=1
+            LENS.aperture(scene),
+            LENS.grid(scene),
+            scene.wavelength_nm,
+            lambda_n_um(scene),
+            tolerance=t,
+            n_modes=None,
+            n_threads=1,
         ).n_modes
         for t in (0.5, 0.1, 0.02, 0.01)
     ]
@@ -159,7 +170,13 @@ def test_more_points_reach_the_tolerance():
     strong = Seidel(coma_um=0.48, astigmatism_um=0.36, field_curvature_um=0.3, field_radius_um=30.0)
     lens, scene = replace(LENS, seidel=strong), noise()
     modes = find_modes(
-        lens.aperture(scene), lens.grid(scene), scene.wavelength_nm, tolerance=0.01, n_modes=None, n_threads=2
+        lens.aperture(scene),
+        lens.grid(scene),
+        scene.wavelength_nm,
+        lambda_n_um(scene),
+        tolerance=0.01,
+        n_modes=None,
+        n_threads=2,
     )
 
     assert modes.points_um.shape == (17 * 17, 2)
