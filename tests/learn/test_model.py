@@ -15,7 +15,7 @@ from foveasim import learn
 from foveasim.distortion import BrownConrady, Fisheye, PolynomialFisheye, Scaramuzza
 from foveasim.integrate import UndistortedOutlines
 from foveasim.learn.distortion import coefficient_values
-from foveasim.optics import LateralColour, PupilImage, Seidel, Zernike
+from foveasim.optics import LateralColour, PSFGrid, PupilImage, Seidel, Zernike
 from foveasim.sensor.effects import Diffusion, InterPixelCapacitance
 
 #: The pictures and focal lengths are small, so that every derivative can be compared.
@@ -28,6 +28,13 @@ RNG = np.random.default_rng(0)
 ZERNIKE = Zernike(coefficients={4: 0.1, 7: 0.15})
 SEIDEL = Seidel(spherical_um=0.2, coma_um=0.2, astigmatism_um=0.1, field_curvature_um=0.05, field_radius_um=20.0)
 PUPIL = PupilImage(0.5 + 0.5 * RNG.random((3, 3)))
+
+#: A spot that moves and darkens towards the edges of the picture.
+PSFS = PSFGrid.from_arrays(
+    [np.exp(-0.25 * np.square(np.hypot(*np.mgrid[-9 - y : 10 - y, -9 - x : 10 - x]))) for y in (-1, 1) for x in (-1, 2)],
+    x_um=[-15.0, 15.0, -15.0, 15.0], y_um=[-12.0, -12.0, 12.0, 12.0], wavelength_nm=550.0, pitch_um=1.0,
+    relative_illumination=[0.7, 0.9, 0.8, 1.0],
+)  # fmt: skip
 
 
 def lens(**changes):
@@ -64,6 +71,8 @@ def test_maps_agree_with_simulator(padding, oversample):
         ({"seidel": SEIDEL, "field_patches": 3, "oversample": 2}, ()),
         ({"seidel": SEIDEL}, ()),
         ({"seidel": SEIDEL, "oversample": 2, "padding": "periodic"}, ()),
+        ({"psfs": PSFS}, ()),
+        ({"psfs": PSFS, "oversample": 2, "padding": "zero"}, ()),
         ({"pupil": PUPIL, "oversample": 2}, ("pupil",)),
         ({"pupil": PUPIL, "zernike": ZERNIKE}, ("pupil", "zernike")),
     ],
@@ -92,6 +101,7 @@ def test_variable_lenses_agree_with_simulator(changes, wrt):
         ({"zernike": ZERNIKE, "oversample": 2}, ("zernike",)),
         ({"seidel": SEIDEL, "field_patches": 2}, ("seidel",)),
         ({"seidel": SEIDEL, "field_modes": 3}, ()),
+        ({"psfs": PSFS, "field_modes": 2}, ()),
         ({"pupil": PUPIL}, ("pupil",)),
     ],
 )
@@ -144,6 +154,7 @@ def test_defocus_is_found_by_descent():
         ({"seidel": SEIDEL}, ("zernike",), "without optics.zernike"),
         ({}, ("seidel",), "without optics.seidel"),
         ({}, ("pupil",), "PupilImage"),
+        ({"psfs": PSFS}, ("zernike",), "must be empty for a lens with 'psfs', whose aberrations are fixed"),
         ({"zernike": Zernike(coefficients={4: 0.1}, unit="waves")}, ("zernike",), "depend on the wavelength"),
         (
             {"lateral_colour": LateralColour(wavelength_nm=[450, 650], magnification=[1.0, 1.01])},

@@ -67,7 +67,7 @@ def test_all_modes_equal_patches(options, changes):
     modes = replace(lens, field_modes=80).power_map(scene).data
 
     # Aliases are interpolated to 1e-4 of the peak, for transforms of other sizes; smaller images have their own patches.
-    tolerance = 1e-3 if options.get("pitch_um") == 600.0 else 5e-3 if "lateral_colour" in changes else 1e-11
+    tolerance = 1e-3 if options.get("pitch_um") == 600.0 else 5e-3 if "lateral_colour" in changes else 1e-12
     np.testing.assert_allclose(modes, patches, atol=tolerance * patches.max())
 
 
@@ -76,7 +76,7 @@ def test_all_modes_equal_patches_in_single_precision():
     scene, lens = noise(), replace(LENS, precision="single")
     patches = replace(lens, field_patches=9).power_map(scene).data
 
-    np.testing.assert_allclose(replace(lens, field_modes=80).power_map(scene).data, patches, atol=2e-6 * patches.max())
+    np.testing.assert_allclose(replace(lens, field_modes=80).power_map(scene).data, patches, atol=1e-6 * patches.max())
 
 
 @pytest.mark.parametrize("padding", ["periodic", "zero", "reflect", "edge"])
@@ -136,6 +136,33 @@ def test_field_error_bounds_displaced_light(tolerance):
 
     assert max(displaced) <= error
     assert max(displaced) > 0.1 * error
+
+
+def test_wide_cells_need_fewer_modes():
+    # Cells of 2.3 λN: light that is displaced within them does not count.
+    n = 64
+    wide = replace(LENS, seidel=replace(SEIDEL, field_radius_um=100.0), padding_cells=20)
+    blank = scene_of(np.zeros((n, n)), pitch_um=600.0)
+    grid, error = wide.grid(blank), wide.field_error(blank)
+    fine = find_modes(
+        wide.aperture(blank), replace(grid, shape=(8 * n, 8 * n), pitch_um=grid.pitch_x_um / 8), blank.wavelength_nm,
+        lambda_n_um(blank), tolerance=0.01, n_modes=None, n_threads=1,
+    )  # fmt: skip
+    assert wide._field_modes(blank, 1).n_modes < fine.n_modes - 3
+    displaced = []
+    for row, column in np.random.default_rng(4).integers(4, n - 4, (20, 2)):
+        image = np.zeros((n, n))
+        image[row, column] = 1.0
+        x_um, y_um = float(grid.x_um[column]), float(grid.y_um[row])
+
+        def pupil(x, y, wave_nm, at=(x_um, y_um)):
+            return np.exp(2j * np.pi * wide.seidel.wavefront_um(x, y, wave_nm, at) / (1e-3 * wave_nm))
+
+        scene = scene_of(image, pitch_um=600.0)
+        expected = replace(wide, seidel=None, pupil=pupil).power_map(scene).data[0]
+        displaced.append(0.5 * np.abs(wide.power_map(scene).data[0] - expected).sum() / expected.sum())
+
+    assert max(displaced) <= error <= 0.01
 
 
 def test_fewer_modes_suffice_for_larger_tolerances():
