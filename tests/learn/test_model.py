@@ -32,7 +32,7 @@ PUPIL = PupilImage(0.5 + 0.5 * RNG.random((3, 3)))
 #: A spot that moves and darkens towards the edges of the picture.
 PSFS = PSFGrid.from_arrays(
     [np.exp(-0.25 * np.square(np.hypot(*np.mgrid[-9 - y : 10 - y, -9 - x : 10 - x]))) for y in (-1, 1) for x in (-1, 2)],
-    x_um=[-15.0, 15.0, -15.0, 15.0], y_um=[-12.0, -12.0, 12.0, 12.0], wavelength_nm=550.0, pitch_um=1.0,
+    x_um=[-20.0, 20.0, -20.0, 20.0], y_um=[-20.0, -20.0, 20.0, 20.0], wavelength_nm=550.0, pitch_um=1.0,
     relative_illumination=[0.7, 0.9, 0.8, 1.0],
 )  # fmt: skip
 

@@ -196,6 +196,9 @@ WORDS: dict[str, Words] = {
     ),
     "preset": Words(synonyms="electronics template published"),
     "prnu_fraction": Words("PRNU", synonyms="fixed pattern non-uniformity"),
+    "psfs": Words(
+        "PSFs", "Point spread functions of a lens design, from a file.", synonyms="point spread zemax aberrations"
+    ),
     "pupil": Words(synonyms="aperture stop iris psf"),
     "qe": Words("quantum efficiency", synonyms="qe sensitivity"),
     "r_max_um": Words("outer radius", synonyms="size format field"),
