@@ -30,6 +30,7 @@ EXTRAS = {
     "learn": {"learn"},
     "maps": {"maps"},
     "modes": {"video"},
+    "optics": {"maps"},
     "scene": {"maps"},
     "studio": {"studio"},
     "tiles": {"video"},

@@ -95,6 +95,9 @@ class PSFModel(Protocol):
     def illumination(self, field_um: Floats) -> Floats | None:
         """Return the relative illumination at positions (n, 2), None for that of a thin lens."""
 
+    def relative_power(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
+        """Return the relative illumination at a wavelength over that of :meth:`illumination`."""
+
     def blur_lambda_n(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
         """Return the radius of the blur without diffraction."""
 
@@ -170,6 +173,18 @@ def overlaps(n_to: int, to_step: float, n_from: int, from_step: float, offset: f
     return diags_array(np.full(n_to, 1.0 / to_step)) @ lengths_of_overlap.tocsr()
 
 
+def check_reach(lambda_n_um: float, x_um: Floats, y_um: Floats) -> float:
+    """Return the largest distance of points in λN/2; raise a ParameterError beyond a limit."""
+    reach = 2.0 * float(max(np.abs(x_um).max(), np.abs(y_um).max())) / lambda_n_um
+    if reach > 0.5 * MAX_ACROSS:
+        raise ParameterError(
+            "pitch_um",
+            f"times (n_points - 1) / 2 must be at most {MAX_ACROSS // 4} λN = "
+            f"{0.25 * MAX_ACROSS * lambda_n_um:.4g} µm for a sampled pupil, got {0.5 * reach * lambda_n_um:.4g} µm",
+        )
+    return reach
+
+
 @dataclass(frozen=True, eq=False)
 class Aperture:
     """
@@ -190,6 +205,10 @@ class Aperture:
 
     def illumination(self, field_um: Floats) -> None:
         """Return None: the relative illumination is that of the thin lens."""
+
+    def relative_power(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:  # noqa: ARG002
+        """Return 1: the relative illumination is that of all wavelengths."""
+        return 1.0
 
     @cached_property
     def is_achromatic(self) -> bool:
@@ -476,13 +495,7 @@ class Aperture:
         self, wavelength_nm: float, lambda_n_um: float, x_um: Floats, y_um: Floats, field_um: tuple[float, float]
     ) -> Floats:
         """Sample the PSF of unit energy, 1/µm², at equidistant points (y, x), (n_y, n_x)."""
-        reach = 2.0 * max(np.abs(x_um).max(), np.abs(y_um).max()) / lambda_n_um
-        if reach > 0.5 * MAX_ACROSS:
-            raise ParameterError(
-                "pitch_um",
-                f"times (n_points - 1) / 2 must be at most {MAX_ACROSS // 4} λN = "
-                f"{0.25 * MAX_ACROSS * lambda_n_um:.4g} µm for a sampled pupil, got {0.5 * reach * lambda_n_um:.4g} µm",
-            )
+        reach = check_reach(lambda_n_um, x_um, y_um)
         # At the image distance D of an aperture of radius a, the phase of the point x changes by 2π a x / (λ D) per radius.
         along_y, along_x = (np.pi / lambda_n_um * at for at in (y_um, x_um))
         radians, integrals = self._resolve(wavelength_nm, field_um)

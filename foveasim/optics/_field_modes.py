@@ -60,11 +60,11 @@ class FieldWeight:
         return np.einsum("yi,ix->yx", self.along_y, self.profiles)
 
 
-def field_weights(at_points: Floats, shape: tuple[int, int]) -> list[FieldWeight]:
+def field_weights(at_points: Floats, shape: tuple[int, int], degree: int = 3) -> list[FieldWeight]:
     """Return splines through values (m, n, n) at equidistant points of a picture."""
     # Local functions along y: the spline through unit values at one point does not vanish between the others.
-    along_y, coefficients = splines(at_points.shape[1], (np.arange(shape[0]) + 0.5) / shape[0])
-    along_x = interpolation(at_points.shape[2], (np.arange(shape[1]) + 0.5) / shape[1])
+    along_y, coefficients = splines(at_points.shape[1], (np.arange(shape[0]) + 0.5) / shape[0], degree)
+    along_x = interpolation(at_points.shape[2], (np.arange(shape[1]) + 0.5) / shape[1], degree)
     # Not as matrix products: the threads of BLAS would compete with ours.
     of_splines = np.einsum("ki,mij->mkj", coefficients, at_points)
     return [FieldWeight(along_y, np.einsum("kj,xj->kx", each, along_x)) for each in of_splines]
@@ -97,21 +97,21 @@ class FieldModes:
         return field_weights(self.at_points[1:], shape)
 
 
-def splines(n_points: int, at: Floats) -> tuple[Floats, Floats]:
+def splines(n_points: int, at: Floats, degree: int = 3) -> tuple[Floats, Floats]:
     """
-    Return cubic B-splines at positions from 0 to 1, (n, n_spline), and their coefficients.
+    Return B-splines at positions from 0 to 1, (n, n_spline), and their coefficients.
 
     The coefficients (n_spline, n_points) are those of the splines through unit values at equidistant points.
     """
     from scipy.interpolate import BSpline, make_interp_spline
 
-    spline = make_interp_spline(np.linspace(0.0, 1.0, n_points), np.eye(n_points), k=min(3, n_points - 1))
+    spline = make_interp_spline(np.linspace(0.0, 1.0, n_points), np.eye(n_points), k=min(degree, n_points - 1))
     return BSpline.design_matrix(at, spline.t, spline.k).toarray(), np.asarray(spline.c)
 
 
-def interpolation(n_points: int, at: Floats) -> Floats:
-    """Return the matrix (n, n_points) of cubic splines through equidistant points from 0 to 1."""
-    along, coefficients = splines(n_points, at)
+def interpolation(n_points: int, at: Floats, degree: int = 3) -> Floats:
+    """Return the matrix (n, n_points) of splines through equidistant points from 0 to 1."""
+    along, coefficients = splines(n_points, at, degree)
     return np.einsum("nk,kp->np", along, coefficients)
 
 
@@ -307,7 +307,7 @@ def sampled_psfs(aperture: PSFModel, points_um: Floats, sampling: Sampling, n_th
 
         def compute(k: int, w: int = w, wave_nm: float = wave_nm) -> None:
             psf = aperture.sampled_psf(wave_nm, sampling.n_across, sampling.radius, points[k], real)
-            psfs[k, w] = sampling.sums(psf, w).ravel()
+            psfs[k, w] = sampling.sums(psf, w).ravel() * real(aperture.relative_power(wave_nm, points[k]))
 
         compute(0)  # samples the pupil, which all points share
         parallel_map(compute, range(1, len(points)), n_threads)

@@ -56,8 +56,8 @@ MAX_OVERSAMPLE = 16
 FINE_CELLS_PER_LAMBDA_N = 5.5
 #: Largest relative error for photosites of side λN and n cells per λN, ``CELL_ERROR * n ** CELL_ERROR_POWER``, and its limit.
 CELL_ERROR, CELL_ERROR_POWER, LARGEST_CELL_ERROR = 0.16, -3.1, 0.2
-#: Points along each side of the picture between which the relative illumination is interpolated.
-ILLUMINATION_POINTS = 33
+#: Points along each side of the picture between which the relative illumination is interpolated, linearly without overshoot.
+ILLUMINATION_POINTS = 65
 #: Rounding error of interpolated relative illumination.
 ILLUMINATION_ROUNDING = 1e-12
 #: Memory limit of a map: 16 GiB in single precision.
@@ -806,7 +806,7 @@ class Optics(PointImages):
             aperture=aperture,
             is_clear_circle=aperture.is_clear_circle,
             wavelength_nm=wave_nm,
-            lambda_n_um=float(self._cut_off_um(wave_nm, distance_m)),
+            lambda_n_um=float(self.cut_off_um(wave_nm, distance_m)),
             field_um=check_point("field_um", field_um),
         )
 
@@ -837,9 +837,10 @@ class Optics(PointImages):
 
     def _lambda_n_um(self, scene: SceneLike) -> Floats:
         """Return λN at the wavelengths of a scene, or two samples of PSFs if these are coarser."""
-        return self._cut_off_um(scene.wavelength_nm, scene.distance_m)
+        return self.cut_off_um(scene.wavelength_nm, scene.distance_m)
 
-    def _cut_off_um(self, wavelength_nm: Floats | float, distance_m: float) -> Floats:
+    def cut_off_um(self, wavelength_nm: Floats | float, distance_m: float) -> Floats:
+        """Return the period of the cut-off frequency: λN, or two samples of coarser PSFs."""
         lambda_n_um = np.asarray(um_from_nm(wavelength_nm) * self.working_f_number(distance_m))
         return lambda_n_um if self.psfs is None else np.maximum(lambda_n_um, 2.0 * self.psfs.pitch_um)
 
@@ -904,7 +905,7 @@ class Optics(PointImages):
         if values is None:
             return None
         is_one = (np.abs(values - 1.0) <= ILLUMINATION_ROUNDING).all()
-        return [] if is_one else field_weights(values.reshape(1, *points_um.shape[:2]), pixels.shape)
+        return [] if is_one else field_weights(values.reshape(1, *points_um.shape[:2]), pixels.shape, degree=1)
 
     def _squared_tangents(self, scene: SceneLike) -> tuple[Floats, Floats]:
         """Return (x0/H)² of the scene columns and (y0/H)² of the scene rows."""

@@ -193,7 +193,8 @@ class PlaneTables:
             otf = self._aperture.compute_otf(
                 float(self._wavelength_nm[k]), n_across, self._n_lags, self._points_um[point], self._real
             )
-            for i, weight in enumerate(spectra[:, k]):
+            power = self._aperture.relative_power(float(self._wavelength_nm[k]), self._points_um[point])
+            for i, weight in enumerate(spectra[:, k] * power):
                 if weight:
                     part = self._real(weight) * otf
                     total = sums[i]

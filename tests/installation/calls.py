@@ -119,6 +119,11 @@ class Objects:
         return fs.Optics(focal_length_mm=8.0, f_number=2.8)
 
     @cached_property
+    def psfs(self):
+        spot = np.pad(np.ones((3, 3)), 4)
+        return fs.optics.PSFGrid.from_arrays(spot, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0)
+
+    @cached_property
     def sensor(self):
         return fs.Sensor(
             self.layout,
@@ -569,6 +574,8 @@ CALLS = {
     "optics.circular_otf": lambda o: optics.circular_otf([0.0, 0.5]),
     "optics.noll_to_nm": lambda o: optics.noll_to_nm(4),
     "optics.osa_to_nm": lambda o: optics.osa_to_nm(4),
+    "optics.read_psfs": lambda o: optics.read_psfs(o.written(".npz", o.psfs.write)),
+    "optics.read_psfs fits": lambda o: optics.read_psfs(o.written(".fits", o.psfs.write)),
     "optics.zernike": lambda o: optics.zernike(2, 0, [0.1], [0.2]),
     "optics.PupilImage": lambda o: optics.PupilImage(np.ones((16, 16))),
     "reconstruct.blur_kernel": lambda o: reconstruct.blur_kernel(o.optics, o.grid, wavelength_nm=550.0),

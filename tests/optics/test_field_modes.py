@@ -39,7 +39,7 @@ def lambda_n_um(scene):
 def linear(monkeypatch):
     """Weights that are linear between the points, as those of patches."""
 
-    def splines(n_points, at):
+    def splines(n_points, at, degree=3):
         unit = np.eye(n_points)
         return np.stack([np.interp(at, np.linspace(0, 1, n_points), row) for row in unit], axis=1), unit
 

@@ -295,6 +295,58 @@ def test_positions_beyond_points_have_the_nearest_psf():
     np.testing.assert_allclose(one, other, atol=1e-12)
 
 
+def test_uneven_points_do_not_overshoot():
+    sizes = (3.0, 3.0, 3.5, 5.0, 8.0)
+    spots = [np.exp(-0.5 * np.square(np.hypot(*np.mgrid[-24:25, -24:25]) / size)) for size in sizes]
+    heights_um = [0.0, 2000.0, 2800.0, 3000.0, 3100.0]
+    fraction = [1.0, 1.0, 0.9, 0.2, 0.01]
+    psfs = PSFGrid.from_arrays(
+        spots, x_um=heights_um, y_um=np.zeros(5), wavelength_nm=WAVE_NM, pitch_um=1.0, relative_illumination=fraction
+    )
+    lens = with_psfs(psfs)
+    found, nearest = (lens.psf(WAVE_NM, distance_m=1.0, field_um=(x_um, 0.0)).psf_per_um2 for x_um in (1000.0, 2000.0))
+    np.testing.assert_allclose(found, nearest, atol=1e-6 * nearest.max())
+    at_um = np.column_stack((np.linspace(0.0, 3200.0, 100), np.zeros(100)))
+    light = lens.aperture(noise()).illumination(at_um)
+    assert 0.0 <= light.min() < light.max() <= 1.0
+
+
+def test_turned_windows_are_not_cut_off():
+    y, x = np.mgrid[-32:33, -8:9]
+    spot = np.exp(-0.5 * (np.square(y / 10.0) + np.square(x / 2.0)))
+    psfs = PSFGrid.from_arrays([spot, spot], x_um=[0.0, 0.0], y_um=[0.0, 500.0], wavelength_nm=WAVE_NM, pitch_um=1.0)
+    lens = with_psfs(psfs)
+    one, other = (
+        lens.psf(WAVE_NM, distance_m=1.0, field_um=at_um, pitch_um=1.0, n_points=65).psf_per_um2
+        for at_um in ((0.0, 500.0), (500.0, 0.0))
+    )
+    np.testing.assert_allclose(other, one.T, atol=2e-3 * one.max())
+
+
+def test_point_images_have_unit_power():
+    fraction = np.array([[1.0, 1.0], [0.9, 0.5]])
+    spot = np.exp(-0.5 * np.square(np.hypot(*np.mgrid[-16:17, -16:17]) / 3.0))
+    psfs = PSFGrid.from_arrays(
+        np.broadcast_to(spot, (2, 2, 33, 33)), x_um=[0.0, 0.0], y_um=[0.0, 500.0], wavelength_nm=[450.0, 650.0],
+        pitch_um=0.8, relative_illumination=fraction,
+    )  # fmt: skip
+    lens = with_psfs(psfs)
+    for wave_nm in (450.0, 650.0):
+        assert lens.mtf([0.0], wave_nm, field_um=(0.0, 500.0))[0] == pytest.approx(1.0, rel=1e-9)
+    assert float(lens.encircled_energy([20.0], 450.0, field_um=(0.0, 500.0))[0]) == pytest.approx(1.0, abs=5e-3)
+    with pytest.raises(ParameterError, match=r"'pitch_um' times \(n_points - 1\) / 2 must be at most"):
+        lens.psf(550.0, pitch_um=50.0, n_points=1025)
+
+
+def test_steep_vignetting_gives_no_negative_light():
+    table = IlluminationTable(image_height_um=(0.0, 20.0, 20.5), fraction=(1.0, 1.0, 0.0))
+    lens = replace(LENS, relative_illumination=table, padding="edge")
+    found = lens.power_map(scene_of(np.ones((60, 54)))).data
+
+    assert found.min() >= -1e-9 * found.max()
+    assert found.max() <= 1.001 * found[0, 27, 30]
+
+
 def test_one_psf_is_that_of_the_field():
     rng = np.random.default_rng(5)
     mask = np.where(rng.random((11, 11)) < 0.2, 1.0, 0.0)
@@ -343,7 +395,7 @@ def test_table_of_the_cosine_law_gives_it():
     expected = lens.power_map(scene).data
     assert expected.min() < 0.8 * expected.max()
 
-    np.testing.assert_allclose(replace(lens, relative_illumination=table).power_map(scene).data, expected, rtol=2e-4)
+    np.testing.assert_allclose(replace(lens, relative_illumination=table).power_map(scene).data, expected, rtol=3e-4)
 
 
 def test_relative_illumination_weighs_the_source():

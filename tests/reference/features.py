@@ -169,11 +169,14 @@ def axes():
                 "optics": {"lateral_colour": {"wavelength_nm": [400.0, 700.0], "magnification": [1.0, 1.01]}}
             },
             "isotropic": {"optics": {"emission": "isotropic"}},
-            "relative_illumination": {
-                "optics": {"relative_illumination": {"image_height_um": [0.0, 1000.0], "fraction": [1.0, 0.6]}}
-            },
             "oversample": {"optics": {"oversample": 3}},
-            "square": {"optics": {"source_pixel": "square", "padding": "edge"}},
+            "square": {
+                "optics": {
+                    "source_pixel": "square",
+                    "padding": "edge",
+                    "relative_illumination": {"image_height_um": [0.0, 1000.0], "fraction": [1.0, 0.6]},
+                }
+            },
         },
         "distortion": {
             "none": {},

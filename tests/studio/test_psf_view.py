@@ -58,7 +58,7 @@ def test_sections_are_those_at_pinned_photosites(simulate):
         (site, axis): np.sum(x * values) / np.sum(values)
         for site in (right, top)
         for axis in "xy"
-        for x, values in [sections[f"photosite {site:,}, along {axis}"]]
+        for x, values in [sections[f"photosite {site:,}, {axis}"]]
     }
 
     # Coma points away from the axis.
@@ -71,6 +71,6 @@ def test_tile_shows_the_point_spread(visit):
     page = visit()
     page.click("[data-tile='psf']")
     until(page, "() => studio.views.made.psf?.chart.curves.length === 4")
-    assert "of the light within a square of its area" in page.inner_text("#tile-psf .chart-note")
+    assert "light within a square of the site's area: nearest" in page.inner_text("#tile-psf .chart-note")
     set_value(page, "optics.f_number", 8.0)
     until(page, "() => studio.isReady && studio.views.made.psf.chart.curves[0].y.every((value) => value < 0.1)")

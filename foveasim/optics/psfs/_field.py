@@ -19,7 +19,7 @@ from foveasim._core.threads import cached_property
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError, SamplingWarning
-from foveasim.optics._aperture import ACROSS_PER_BLUR, MAX_ACROSS, MIN_ACROSS
+from foveasim.optics._aperture import ACROSS_PER_BLUR, MAX_ACROSS, MIN_ACROSS, check_reach
 from foveasim.units import um_from_nm
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 BLUR_FRACTION, AIRY_LAMBDA_N = 0.95, 4.25
 #: Samples per sample before PSFs are turned, and order of the spline: 1e-4 of the amplitude at λN/2 per sample.
 FINER, SPLINE_ORDER = 3, 5
+#: Largest ratio of the distances of points that are interpolated by cubic splines: those through others overshoot.
+MAX_STEP_RATIO = 2.0
 #: Relative rounding error of distances of samples in files.
 ROUNDING = 1e-3
 
@@ -135,6 +137,11 @@ class FieldPSFs:
             found[p] = np.fft.ifft2(spectra).real
         return found
 
+    @property
+    def _turned_side(self) -> int:
+        """Odd number of samples along a side that contains turned PSFs."""
+        return 2 * math.ceil(0.5 * math.hypot(*self.psfs.psf.shape[2:])) + 1
+
     @cached_property
     def _splines(self) -> NDArray[Any]:
         """Spline coefficients of finer samples, (n_point, n_wavelength, k n_y, k n_x)."""
@@ -142,6 +149,8 @@ class FieldPSFs:
         from scipy.signal import resample
 
         psf = self._central
+        half = [(self._turned_side - n) // 2 for n in psf.shape[2:]]
+        psf = np.pad(psf, [(0, 0), (0, 0), *((each, each) for each in half)])
         for axis in (2, 3):
             # From the first to the last sample, symmetric around the centre.
             finer = resample(psf, FINER * psf.shape[axis], axis=axis)
@@ -161,7 +170,7 @@ class FieldPSFs:
         height_um = np.hypot(field_um[:, 0], field_um[:, 1])
         at_um = field_um.T if len(axes) == 2 else height_um[np.newaxis]
         along = [
-            make_interp_spline(axis, np.eye(axis.size), k=min(3, axis.size - 1))(np.clip(at, axis[0], axis[-1]))
+            make_interp_spline(axis, np.eye(axis.size), k=_degree(axis))(np.clip(at, axis[0], axis[-1]))
             for axis, at in zip(axes, at_um, strict=True)
         ]
         weights = np.empty((n, self.psfs.x_um.size))
@@ -179,41 +188,47 @@ class FieldPSFs:
     def illumination(self, field_um: Floats) -> Floats | None:
         """Return the mean relative illumination at positions (n, 2); None if unknown."""
         fraction = self.psfs.relative_illumination
-        return None if fraction is None else self._weights(field_um)[0] @ fraction.mean(axis=1)
+        return None if fraction is None else np.maximum(self._weights(field_um)[0] @ fraction.mean(axis=1), 0.0)
 
-    def _sample(self, wavelength_nm: float, field_um: tuple[float, float]) -> tuple[NDArray[Any], Floats, float]:
-        """Return the PSF without displacement, (n_y, n_x), its displacement, and its sum."""
+    def relative_power(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
+        """Return the relative illumination at a wavelength over the mean of all."""
+        fraction = self.psfs.relative_illumination
+        if fraction is None or not np.ptp(fraction, axis=1).any():
+            return 1.0
+        weights = self._weights(np.array([field_um], np.float64))[0][0]
+        mean = float(weights @ fraction.mean(axis=1))
+        return max(0.0, float(weights @ fraction @ self._of_wavelength(wavelength_nm)) / mean) if mean > 0.0 else 1.0
+
+    def _sample(self, wavelength_nm: float, field_um: tuple[float, float]) -> tuple[NDArray[Any], Floats]:
+        """Return the PSF without displacement, (n_y, n_x), and its displacement."""
         (weights,), (angle_rad,) = self._weights(np.array([field_um], np.float64))
         waves = self._of_wavelength(wavelength_nm)
         source = self._splines if angle_rad else self._central
         psf = np.zeros(source.shape[2:], source.dtype)
         for w in np.flatnonzero(waves):
-            psf += np.tensordot((waves[w] * weights).astype(source.dtype), source[:, w], 1)
+            psf += np.einsum("p,pyx->yx", (waves[w] * weights).astype(source.dtype), source[:, w])
         if angle_rad:
             psf = self._turn(psf, float(angle_rad))
-        fraction, total = self.psfs.relative_illumination, 1.0
-        if fraction is not None and np.ptp(fraction, axis=1).any():
-            total = float((weights @ fraction @ waves) / (weights @ fraction.mean(axis=1)))
         if not self.psfs.is_varying:  # the samples contain the displacement
-            return psf, np.zeros(2), total
+            return psf, np.zeros(2)
         x_um, y_um = np.einsum("p,pwi,w->i", weights, self.psfs.centroid_um, waves)
         cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-        return psf, np.array([cos * x_um - sin * y_um, sin * x_um + cos * y_um]), total
+        return psf, np.array([cos * x_um - sin * y_um, sin * x_um + cos * y_um])
 
     def _turn(self, coefficients: NDArray[Any], angle_rad: float) -> NDArray[Any]:
         """Return samples of a spline, turned counter-clockwise around the centre."""
         from scipy.ndimage import affine_transform
 
-        n_y, n_x = self.psfs.psf.shape[2:]
+        n = self._turned_side
         cos, sin = math.cos(angle_rad), math.sin(angle_rad)
         # From rows and columns of the result to those of the finer samples.
         matrix = FINER * np.array([[cos, -sin], [sin, cos]])
-        centre = np.array([n_y // 2, n_x // 2])
+        centre = np.array([n // 2, n // 2])
         turned = affine_transform(  # type: ignore[call-overload]
             coefficients,
             matrix,
             FINER * centre - matrix @ centre,
-            (n_y, n_x),
+            (n, n),
             order=SPLINE_ORDER,
             mode="constant",
             prefilter=False,
@@ -235,29 +250,20 @@ class FieldPSFs:
 
         Returns (2 n_lags + 1, 2 n_lags + 1) complex64 or complex128, rows along y: 0 from the cut-off frequency ``1 / u``.
         """
+        psf, displacement_um = self._sample(wavelength_nm, field_um)
+        step = self.psfs.pitch_um / (n_across * float(self.unit_um(wavelength_nm)))
         lags = np.arange(-n_lags, n_lags + 1)
-        # The OTF of a real PSF at -f is the complex conjugate: rows k >= 0 suffice.
-        upper = self._otf(wavelength_nm, lags[n_lags:] / n_across, lags / n_across, field_um, real)
-        upper[np.hypot(lags[n_lags:, np.newaxis], lags) >= n_across] = 0.0
-        return np.concatenate((np.conj(upper[:0:-1, ::-1]), upper))
-
-    def _otf(
-        self, wavelength_nm: float, s_y: Floats, s_x: Floats, field_um: tuple[float, float], real: Any = np.float64
-    ) -> NDArray[np.complexfloating[Any]]:
-        """Return the OTF at products of frequencies (n_fy, n_fx), in units of ``1 / u``."""
-        psf, displacement_um, total = self._sample(wavelength_nm, field_um)
-        pitch_um, unit_um = self.psfs.pitch_um, float(self.unit_um(wavelength_nm))
-        complex_type = np.result_type(real, np.complex64)
-        waves = []
-        for s, n, displaced_um in zip((s_y, s_x), psf.shape, displacement_um[::-1], strict=True):
-            per_um = s / unit_um
-            at_um = (np.arange(n) - n // 2) * pitch_um + displaced_um
-            wave = np.exp(-2j * np.pi * np.outer(per_um, at_um))
+        # The OTF of a real PSF at -f is the complex conjugate: rows k >= 0 suffice. Chirp z-transforms instead of matrix
+        # products, since the threads of BLAS would compete with ours.
+        upper = _fourier(_fourier(psf, lags * step, 1), lags[n_lags:] * step, 0)
+        for axis, (k, displaced_um) in enumerate(zip((lags[n_lags:], lags), displacement_um[::-1], strict=True)):
+            factor = np.exp(-2j * np.pi * (displaced_um / self.psfs.pitch_um) * step * k)
             if self.psfs.samples == "bins":
-                wave /= np.sinc(per_um * pitch_um)[:, np.newaxis]
-            waves.append(wave.astype(complex_type))
-        found = waves[0] @ psf.astype(real) @ waves[1].T
-        return np.asarray(found * real(total))
+                factor /= np.sinc(k * step)
+            upper *= np.expand_dims(factor, 1 - axis)
+        upper[np.hypot(lags[n_lags:, np.newaxis], lags) >= n_across] = 0.0
+        upper = np.ascontiguousarray(upper, np.result_type(real, np.complex64))
+        return np.concatenate((np.conj(upper[:0:-1, ::-1]), upper))
 
     def sampled_psf(
         self, wavelength_nm: float, n_across: int, radius: int, field_um: tuple[float, float], real: Any
@@ -266,19 +272,16 @@ class FieldPSFs:
         # Fewer frequencies than for interpolation suffice, so that copies of the PSF, 2 n multiples apart, do not overlap it.
         half = 0.5 * max(self.psfs.psf.shape[2:]) * self.psfs.pitch_um / (0.5 * float(self.unit_um(wavelength_nm)))
         n = min(n_across, math.ceil(0.5 * (radius + half)) + 1)
-        otf = self.compute_otf(wavelength_nm, n, n, field_um, real)
-        waves = np.exp(1j * np.pi / n * np.outer(np.arange(-radius, radius + 1), np.arange(-n, n + 1))).astype(
-            otf.dtype
-        )
-        return np.asarray((waves @ otf @ waves.T).real / real(4 * n * n))
+        otf = self.compute_otf(wavelength_nm, n, n, field_um, np.float64)
+        at = np.arange(-radius, radius + 1) * (-0.5 / n)
+        return np.asarray(_fourier(_fourier(otf, at, 1), at, 0).real / (4 * n * n), real)
 
     def psf_per_um2(
         self, wavelength_nm: float, lambda_n_um: float, x_um: Floats, y_um: Floats, field_um: tuple[float, float]
     ) -> Floats:
         """Sample the PSF, 1/µm², at points (y, x), (n_y, n_x)."""
-        n = self.n_across(wavelength_nm, field_um)
-        reach = 2.0 * max(np.abs(x_um).max(), np.abs(y_um).max()) / lambda_n_um
-        n = max(n, math.ceil(2.0 * reach))
+        reach = check_reach(lambda_n_um, x_um, y_um)
+        n = max(self.n_across(wavelength_nm, field_um), math.ceil(2.0 * reach))
         otf = self.compute_otf(wavelength_nm, n, n, field_um, np.float64)
         s = np.arange(-n, n + 1) / (n * lambda_n_um)
         waves = [np.exp(2j * np.pi * np.outer(at_um, s)) for at_um in (y_um, x_um)]
@@ -295,11 +298,30 @@ class FieldPSFs:
         self, wavelength_nm: float, s_x: Floats, s_y: Floats, field_um: tuple[float, float]
     ) -> NDArray[np.complex128]:
         """Return the OTF at frequencies in units of ``1 / u``."""
+        psf, displacement_um = self._sample(wavelength_nm, field_um)
         x, y = np.broadcast_arrays(np.asarray(s_x, np.float64), np.asarray(s_y, np.float64))
-        found = [
-            self._otf(wavelength_nm, np.array([fy]), np.array([fx]), field_um)[0, 0]
-            if math.hypot(fx, fy) < 1.0
-            else 0.0
-            for fx, fy in zip(x.ravel(), y.ravel(), strict=True)
-        ]
-        return np.array(found, np.complex128).reshape(x.shape)
+        pitch_um, unit_um = self.psfs.pitch_um, float(self.unit_um(wavelength_nm))
+        along_y, along_x = (
+            np.exp(-2j * np.pi / unit_um * np.outer(s.ravel(), (np.arange(n) - n // 2) * pitch_um + displaced_um))
+            for s, n, displaced_um in zip((y, x), psf.shape, displacement_um[::-1], strict=True)
+        )
+        found = np.einsum("fy,yx,fx->f", along_y, psf, along_x, optimize=True)
+        if self.psfs.samples == "bins":
+            found /= (np.sinc(x * pitch_um / unit_um) * np.sinc(y * pitch_um / unit_um)).ravel()
+        return np.where(np.hypot(x, y) < 1.0, found.reshape(x.shape), 0.0)
+
+
+def _degree(axes: Floats) -> int:
+    """Return the degree of splines: cubic through about equidistant coordinates, or linear."""
+    steps = np.diff(axes)
+    return min(3, axes.size - 1) if steps.max() <= MAX_STEP_RATIO * steps.min() else 1
+
+
+def _fourier(values: NDArray[Any], cycles: NDArray[Any], axis: int) -> NDArray[np.complex128]:
+    """Transform values around the middle one, at equidistant cycles per value."""
+    from scipy.signal import czt
+
+    step = float(cycles[1] - cycles[0]) if cycles.size > 1 else 0.0
+    found = czt(values, cycles.size, np.exp(-2j * np.pi * step), np.exp(2j * np.pi * float(cycles[0])), axis=axis)
+    centre = np.exp(2j * np.pi * cycles * (values.shape[axis] // 2))
+    return np.asarray(found * np.expand_dims(centre, 1 - axis))

@@ -26,6 +26,8 @@ from foveasim.errors import ParameterError, SamplingWarning
 
 #: Largest number of values: 2 GiB in double precision.
 MAX_VALUES = 1 << 28
+#: Largest number of values of PSFs that are turned, of which finer samples are stored.
+MAX_TURNED_VALUES = 1 << 24
 #: Largest number of field points and of samples along a side.
 MAX_POINTS, MAX_SIDE = 4096, 8192
 #: Relative tolerance of equal coordinates, over the extent of the field.
@@ -124,7 +126,8 @@ class PSFGrid:
             if not (fraction.mean(axis=1) > 0.0).all():
                 raise ParameterError("relative_illumination", "must be above 0 at each point for one wavelength")
             set_(self, "relative_illumination", read_only(fraction.copy()))
-        len(self.axes)  # the points form a grid or a radius
+        if len(self.axes) == 1 and psf.size > MAX_TURNED_VALUES:  # the points form a grid or a radius
+            raise ParameterError("psf", f"must have at most {MAX_TURNED_VALUES} values on a radius, got {psf.size}")
         beyond = float(self.beyond_fraction.max())
         if beyond > MAX_BEYOND:
             warn(
@@ -337,7 +340,8 @@ def _check_shape(
         )
     if wavelength_nm.shape != (psf.shape[1],):
         raise ParameterError("wavelength_nm", f"must have {psf.shape[1]} values, one per PSF, got {wavelength_nm.size}")
-    if psf.size > MAX_VALUES or psf.shape[0] > MAX_POINTS or max(psf.shape[2:]) > MAX_SIDE:
+    # One more for the padding of even numbers.
+    if psf.size > MAX_VALUES or psf.shape[0] > MAX_POINTS or max(psf.shape[2:]) > MAX_SIDE + 1:
         raise ParameterError(
             "psf",
             f"must have at most {MAX_POINTS} points, {MAX_SIDE} samples along a side and {MAX_VALUES} values, "
@@ -356,9 +360,13 @@ def _check_apart(x_um: Floats, y_um: Floats) -> None:
     from scipy.spatial import KDTree
 
     points = np.column_stack((x_um, y_um))
-    pairs = KDTree(points).query_pairs(SAME * float(np.abs(points).max()))
-    if pairs:
-        one, other = min(pairs)
+    if len(points) < 2:
+        return
+    found: Any = KDTree(points).query(points, k=2)
+    is_same = found[0][:, 1] <= SAME * float(np.abs(points).max())
+    if is_same.any():
+        one = int(np.argmax(is_same))
+        other = max(int(k) for k in found[1][one] if k != one)
         raise ParameterError(
             "x_um",
             f"and 'y_um' must be different for all points, got ({x_um[one]:g}, {y_um[one]:g}) µm at [{one}] and [{other}]",
@@ -390,6 +398,11 @@ def _centred(psf: NDArray[Any], centre: tuple[int, int] | None) -> NDArray[Any]:
             raise ParameterError("centre", f"must be within the {psf.shape[2]} x {psf.shape[3]} samples", centre)
         half = max(at, n - 1 - at)
         pads.append((half - at, half - (n - 1 - at)))
+    n_padded = psf.shape[0] * psf.shape[1] * math.prod(n + sum(pad) for n, pad in zip(psf.shape[2:], pads, strict=True))
+    if n_padded > MAX_VALUES:
+        raise ParameterError(
+            "centre", f"must be near the middle of the samples, of {psf.shape[2]} x {psf.shape[3]}", centre
+        )
     return np.pad(psf, [(0, 0), (0, 0), *pads])
 
 

@@ -27,18 +27,20 @@ from foveasim._io.yaml_files import MAX_FILE_BYTES as MAX_INDEX_BYTES
 from foveasim._io.yaml_files import parse_yaml
 from foveasim.errors import FileError
 from foveasim.optics.psfs._formats import PSF_FORMATS, choices_of, require
-from foveasim.optics.psfs._grid import MAX_POINTS, MAX_SIDE, PSFGrid
+from foveasim.optics.psfs._grid import MAX_POINTS, MAX_SIDE, MAX_VALUES, PSFGrid
 
 TITLE = re.compile(r"\s*Listing of (FFT|Huygens) PSF Data")
-#: Largest size of a listing: 4096 x 4096 values of 16 characters in UTF-16.
-MAX_BYTES = 2**29
+#: Largest size of a listing: 2048 x 2048 values of 16 characters in UTF-16.
+MAX_BYTES = 2**27
 #: Lengths in µm of the units of listings; "µ" in the encodings of OpticStudio.
 UNITS_UM = {"µm": 1.0, "μm": 1.0, "um": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
-NUMBER = r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
+NUMBER = r"([-+]?[\d.]{1,32}(?:[eE][-+]?\d{1,4})?)"
 WAVES = re.compile(rf"{NUMBER}(?:\s+to\s+{NUMBER})?\s*(\S+)\s+at\s")
 SPACING = re.compile(rf"Data spacing is\s+{NUMBER}\s*(\S+)")
 SIZE = re.compile(r"Image grid size:\s*(\d+)\s*by\s*(\d+)")
 CENTRE = re.compile(r"Center point is:\s*row\s*(\d+),\s*column\s*(\d+)")
+#: Characters and lines of a header that are searched.
+MAX_LINE, MAX_HEADER_LINES = 200, 100
 #: Relative tolerance of wavelengths and distances of samples, which listings round.
 SAME = 1e-3
 KEYS = ("file", "x_um", "y_um", "wavelength_nm")
@@ -62,7 +64,7 @@ def read_listing(path: Path) -> Listing:
     header = next((k for k, line in enumerate(lines) if line.lstrip().startswith("Values are")), None)
     if header is None:
         raise FormatError("has no line 'Values are ...', after which the values begin")
-    text = "\n".join(lines[:header])
+    text = "\n".join(line[:MAX_LINE] for line in lines[: min(header, MAX_HEADER_LINES)])
     waves, spacing, size = (
         _find(pattern, text, what)
         for pattern, what in ((WAVES, "wavelength"), (SPACING, "'Data spacing is'"), (SIZE, "'Image grid size'"))
@@ -137,48 +139,34 @@ def read_index(path: Path) -> PSFGrid:
     entries = _entries(about)
     points = list(dict.fromkeys((entry["x_um"], entry["y_um"]) for entry in entries))
     waves_nm = sorted({entry["wavelength_nm"] for entry in entries})
-    stack: Any = None
     known: dict[tuple[int, int], str] = {}
-    fraction = np.ones((len(points), len(waves_nm)))
-    first: Listing | None = None
     for entry in entries:
-        file = path.parent / entry["file"]
-        if not file.is_file():
-            raise FormatError(f"lists {entry['file']!r:.80}, which does not exist")
-        with as_file_error(file, "listing of a PSF", passes=(FileError,)):
-            one = read_listing(file)
-            if abs(one.wavelength_nm - entry["wavelength_nm"]) > SAME * one.wavelength_nm:
-                raise FormatError(
-                    f"is the PSF at {one.wavelength_nm:g} nm, but {path.name} lists it for {entry['wavelength_nm']:g} nm"
-                )
-            first = one if first is None else first
-            if one.values.shape != first.values.shape or one.centre != first.centre:
-                raise FormatError(
-                    f"has {one.values.shape} values with the centre {one.centre}, expected {first.values.shape} with "
-                    f"{first.centre} as in {entries[0]['file']!r:.80}"
-                )
-            if abs(one.pitch_um - first.pitch_um) > SAME * first.pitch_um:
-                raise FormatError(
-                    f"has samples of {one.pitch_um:g} µm, expected {first.pitch_um:g} µm as in {entries[0]['file']!r:.80}; "
-                    "set the same 'image delta', or resample it"
-                )
-        if stack is None:
-            stack = np.full((len(points), len(waves_nm), *first.values.shape), np.nan)
         at = points.index((entry["x_um"], entry["y_um"])), waves_nm.index(entry["wavelength_nm"])
         if at in known:
             raise FormatError(
                 f"lists {known[at]!r:.80} and {entry['file']!r:.80} for the same point and wavelength; remove one of them"
             )
-        known[at], stack[at] = entry["file"], one.values
-        fraction[at] = entry.get("relative_illumination", 1.0)
+        known[at] = entry["file"]
     for p, (x_um, y_um) in enumerate(points):
         for w, wave_nm in enumerate(waves_nm):
             if (p, w) not in known:
                 raise FormatError(
                     f"lists no PSF at ({x_um:g}, {y_um:g}) µm and {wave_nm:g} nm, a wavelength of other points; add it"
                 )
-    assert first is not None
-    has_illumination = any("relative_illumination" in entry for entry in entries)
+    given = [entry for entry in entries if "relative_illumination" in entry]
+    if given and len(given) < len(entries):
+        missing = next(entry["file"] for entry in entries if "relative_illumination" not in entry)
+        raise FormatError(f"has 'relative_illumination' for some files only; add it to {missing!r:.80}")
+    fraction = np.ones((len(points), len(waves_nm)))
+    first = _listed(path, entries[0], None)
+    n_values = len(entries) * first.values.size
+    if n_values > MAX_VALUES:
+        raise FormatError(f"lists {n_values} values, more than the limit of {MAX_VALUES}")
+    stack = np.empty((len(points), len(waves_nm), *first.values.shape))
+    for number, entry in enumerate(entries):
+        one = _listed(path, entry, (entries[0]["file"], first)) if number else first
+        at = points.index((entry["x_um"], entry["y_um"])), waves_nm.index(entry["wavelength_nm"])
+        stack[at], fraction[at] = one.values, entry.get("relative_illumination", 1.0)
     x_um, y_um = np.array(points).T
     conventions = {"image": "inverted", "first_row": "highest", **choices_of(about)}
     return PSFGrid.from_arrays(
@@ -188,9 +176,36 @@ def read_index(path: Path) -> PSFGrid:
         wavelength_nm=waves_nm,
         pitch_um=first.pitch_um,
         centre=first.centre,
-        relative_illumination=fraction if has_illumination else None,
+        relative_illumination=fraction if given else None,
         **conventions,
     )
+
+
+def _listed(index: Path, entry: dict[str, Any], reference: tuple[str, Listing] | None) -> Listing:
+    """Read the listing of an entry, which must be as the first one."""
+    file = index.parent / entry["file"]
+    if not file.is_file():
+        raise FormatError(f"lists {entry['file']!r:.80}, which does not exist")
+    with as_file_error(file, "listing of a PSF", passes=(FileError,)):
+        one = read_listing(file)
+        if abs(one.wavelength_nm - entry["wavelength_nm"]) > SAME * one.wavelength_nm:
+            raise FormatError(
+                f"is the PSF at {one.wavelength_nm:g} nm, but {index.name} lists it for {entry['wavelength_nm']:g} nm"
+            )
+        if reference is None:
+            return one
+        name, first = reference
+        if one.values.shape != first.values.shape or one.centre != first.centre:
+            raise FormatError(
+                f"has {one.values.shape} values with the centre {one.centre}, expected {first.values.shape} with "
+                f"{first.centre} as in {name!r:.80}"
+            )
+        if abs(one.pitch_um - first.pitch_um) > SAME * first.pitch_um:
+            raise FormatError(
+                f"has samples of {one.pitch_um:g} µm, expected {first.pitch_um:g} µm as in {name!r:.80}; set the same "
+                "'image delta', or resample it"
+            )
+        return one
 
 
 def _entries(about: Any) -> list[dict[str, Any]]:

@@ -10,7 +10,6 @@ import numpy as np
 from foveasim.scene import Scene
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, curves_of, label_of, part
-from foveasim.units import um_from_nm
 
 #: Samples of a section, and half its length in λN beyond the blur.
 N_SAMPLES, MARGIN_LAMBDA_N = 129, 4.0
@@ -26,18 +25,18 @@ def _lens_of(result: Simulated) -> tuple[Any, ...]:
 
 @part("Point spread", _lens_of, order=82, is_lazy=True)
 def psf(result: Simulated) -> PartData:
-    """Return sections of the PSF through the image points of pinned photosites, or of two."""
+    """Return sections of the PSF at pinned photosites, or nearest and farthest from the axis."""
     camera, source = result.shot.camera, result.shot.scene
     if not isinstance(source, Scene):
         return {"curves": [], "note": "A power map contains the point spread of its lens."}, {}
     scene, frame = camera.seen(source), camera.sensor_frame(source)
     points_um = camera.layout.centroid_um + np.array(camera.position_um)
     height_um = np.hypot(*(points_um - frame.axis_um).T)
-    chosen = {"nearest to the axis": int(height_um.argmin()), "farthest from it": int(height_um.argmax())}
+    chosen = {"nearest": int(height_um.argmin()), "farthest": int(height_um.argmax())}
     if result.pinned:
         chosen = {label_of(site): site for site in result.pinned[:MAX_SHOWN]}
     optics, wavelength_nm = camera.optics, float(np.median(scene.wavelength_nm))
-    lambda_n_um = float(um_from_nm(wavelength_nm)) * optics.working_f_number(scene.distance_m)
+    lambda_n_um = float(optics.cut_off_um(wavelength_nm, scene.distance_m))
     curves, x, y, notes = [], [], [], []
     for name, site in chosen.items():
         at_um = points_um[site]
@@ -45,7 +44,7 @@ def psf(result: Simulated) -> PartData:
             at_um = camera.distortion.undistort(at_um, outside="mask")
         field_um = (at_um - frame.axis_um) / frame.scale
         if np.isnan(field_um).any():
-            notes.append(f"{name}: outside the image circle")
+            notes.append(f"{name} outside the image circle")
             continue
         field = float(field_um[0]), float(field_um[1])
         blur = optics.aperture(scene).blur_lambda_n(wavelength_nm, field)
@@ -58,11 +57,13 @@ def psf(result: Simulated) -> PartData:
             pitch_um=2.0 * half_um / (N_SAMPLES - 1),
         )
         for along, section in (("x", found.psf_per_um2[N_SAMPLES // 2]), ("y", found.psf_per_um2[:, N_SAMPLES // 2])):
-            curves.append({"label": f"{name}, along {along}", "unit_x": "µm", "unit_y": "1/µm²"})
+            curves.append({"label": f"{name}, {along}", "unit_x": "µm", "unit_y": "1/µm²"})
             x.append(found.grid.x_um)
             y.append(section)
         side_um = math.sqrt(float(camera.layout.area_um2[site]))
         energy = float(optics.ensquared_energy(side_um, wavelength_nm, distance_m=scene.distance_m, field_um=field))
-        notes.append(f"{name}: {energy:.0%} of the light within a square of its area")
+        notes.append(f"{name} {energy:.0%}")
     about, arrays = curves_of(curves, x, y)
-    return about | {"note": f"{wavelength_nm:g} nm; " + "; ".join(notes)}, arrays
+    return about | {
+        "note": f"{wavelength_nm:g} nm; light within a square of the site's area: {', '.join(notes)}"
+    }, arrays

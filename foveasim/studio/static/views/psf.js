@@ -2,4 +2,4 @@
 
 import { curveView } from "../charts.js";
 
-export const create = curveView({ nameX: "distance from the image point", nameY: "point spread", label: "Point spread" });
+export const create = curveView({ nameX: "distance", nameY: "PSF", label: "Point spread" });
