@@ -19,14 +19,14 @@ import numpy as np
 
 from foveasim._core.extras import import_optional
 from foveasim._io.formats import FileFormat, FormatError
-from foveasim._io.rasters import STEP_TOLERANCE, check_size
+from foveasim._io.rasters import STEP_TOLERANCE
+from foveasim._io.rasters.fits import MAGIC, open_fits, read_image
 from foveasim._io.rasters.units import length_in_um
 from foveasim.fields import PowerMap
 from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._json_metadata import found_in_metadata, map_metadata
 
-MAGIC = b"SIMPLE  ="
 KEYWORD = "FOVEASIM"
 #: Maximum number of header-data units that are searched.
 MAX_HDUS = 64
@@ -59,20 +59,10 @@ def write(power_map: PowerMap, path: Path) -> None:
 
 def read(path: Path, name: str | None) -> Found:
     """Read the image with a name or number, or the first image."""
-    fits = import_optional(path, "astropy.io.fits")
-    n_bytes = path.stat().st_size
-    with (
-        warnings.catch_warnings(),
-        path.open("rb") as binary,  # astropy does not close truncated files
-        fits.open(binary, mode="readonly", memmap=False, disable_image_compression=True, lazy_load_hdus=True) as file,
-    ):
-        warnings.simplefilter("ignore")  # warns about deviations from the standard
+    with open_fits(path) as file:
         hdu = _image(file, name)
         header = hdu.header
-        check_size(hdu.shape, max(abs(int(header["BITPIX"])) // 8, 1), n_bytes)
-        if math.prod(hdu.shape) * abs(int(header["BITPIX"])) // 8 > n_bytes:
-            raise FormatError("is truncated")
-        data = np.asarray(hdu.data)
+        data = read_image(hdu, path.stat().st_size)
         n_axes = data.ndim
         text = header.get(KEYWORD)
         found = found_in_metadata(text if isinstance(text, str) else "", data, is_y_descending=False)

@@ -75,10 +75,6 @@ class PSFModel(Protocol):
     """
 
     @property
-    def pupils(self) -> Sequence[Pupil]:
-        """Amplitude transmissions, multiplied."""
-
-    @property
     def is_clear_circle(self) -> bool:
         """Whether the OTF is that of a clear circle in focus."""
 

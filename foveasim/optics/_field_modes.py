@@ -35,7 +35,7 @@ MAX_WAVELENGTHS = 3
 MAX_SAMPLES, MAX_DOUBLE_SAMPLES = 1 << 28, 1 << 22
 #: Multiple of the tolerance that twice as many points are expected to reach: the error of cubic splines decreases by 16.
 PROMISING = 10.0
-#: Largest number of samples across the aperture, a blur of 24 λN, for more points: some 10 s.
+#: Largest number of samples across the aperture, a blur of 24 λN, for more points: a first frame of some 30 s.
 MAX_ACROSS = 384
 #: If the tolerance cannot be reached, the modes displace this multiple of the least possible.
 UNREACHED = 1.1

@@ -842,7 +842,7 @@ class Optics(PointImages):
     def cut_off_um(self, wavelength_nm: Floats | float, distance_m: float) -> Floats:
         """Return the period of the cut-off frequency: λN, or two samples of coarser PSFs."""
         lambda_n_um = np.asarray(um_from_nm(wavelength_nm) * self.working_f_number(distance_m))
-        return lambda_n_um if self.psfs is None else np.maximum(lambda_n_um, 2.0 * self.psfs.pitch_um)
+        return lambda_n_um if self.psfs is None else np.asarray(self.psfs.cut_off_um(lambda_n_um))
 
     def _field_points_um(self, grid: Grid) -> list[tuple[float, float]]:
         """Return the field points with the strongest aberrations."""

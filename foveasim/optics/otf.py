@@ -194,9 +194,9 @@ class PlaneTables:
                 float(self._wavelength_nm[k]), n_across, self._n_lags, self._points_um[point], self._real
             )
             power = self._aperture.relative_power(float(self._wavelength_nm[k]), self._points_um[point])
-            for i, weight in enumerate(spectra[:, k] * power):
+            for i, weight in enumerate(spectra[:, k]):
                 if weight:
-                    part = self._real(weight) * otf
+                    part = self._real(weight * power) * otf
                     total = sums[i]
                     sums[i] = part if total is None else np.add(total, part, out=total)
         return sums

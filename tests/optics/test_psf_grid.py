@@ -167,7 +167,7 @@ def test_coma_lands_in_its_quadrant(tmp_path, name):
     assert displaced(with_psfs(psfs).power_map(scene).data, expected) < 0.01
     for mirrored in (psfs.psf[..., ::-1], psfs.psf[..., ::-1, :], psfs.psf.swapaxes(2, 3)):
         wrong = with_psfs(replace(psfs, psf=mirrored)).power_map(scene).data
-        assert displaced(wrong, expected) > (0.2 if mirrored is psfs.psf else 0.1)
+        assert displaced(wrong, expected) > 0.4
 
 
 @pytest.mark.parametrize("kind", ["grid", "radius"])
@@ -336,6 +336,19 @@ def test_point_images_have_unit_power():
     assert float(lens.encircled_energy([20.0], 450.0, field_um=(0.0, 500.0))[0]) == pytest.approx(1.0, abs=5e-3)
     with pytest.raises(ParameterError, match=r"'pitch_um' times \(n_points - 1\) / 2 must be at most"):
         lens.psf(550.0, pitch_um=50.0, n_points=1025)
+
+
+def test_wavelength_may_be_dark_at_a_point():
+    spot = np.exp(-0.5 * np.square(np.hypot(*np.mgrid[-16:17, -16:17]) / 3.0))
+    psfs = PSFGrid.from_arrays(
+        np.broadcast_to(spot, (4, 2, 33, 33)), x_um=[-25.0, 25.0, -25.0, 25.0], y_um=[-25.0, -25.0, 25.0, 25.0],
+        wavelength_nm=[500.0, 600.0], pitch_um=0.8, relative_illumination=[[1.0, 1.0], [1.0, 0.0]] * 2,
+    )  # fmt: skip
+    flat = scene_of(np.ones((60, 54)), waves_nm=(500.0, 600.0))
+    one, other = with_psfs(psfs, padding="edge", field_tolerance=0.01).power_map(flat).data
+
+    np.testing.assert_allclose(one[30, 10:-10], one[30, 27], rtol=0.02)
+    assert (np.diff(other[30, 10:-10]) < 0.0).all()
 
 
 def test_steep_vignetting_gives_no_negative_light():
@@ -633,7 +646,7 @@ def test_wrong_fits_files_are_rejected(tmp_path):
         (lambda h: h.pop(1), "has no table 'POINTS' with the columns x_um, y_um"),
         (lambda h: h.pop(2), "has no table 'WAVELENGTHS' with the columns wavelength_nm"),
         (lambda h: h[1].columns.change_name("x_um", "x"), "has no 'x_um', which files of PSFs must contain"),
-        (lambda h: h.__setitem__(0, fits.PrimaryHDU(header=h[0].header)), "is truncated, or contains no image"),
+        (lambda h: h.__setitem__(0, fits.PrimaryHDU(header=h[0].header)), "contains no image"),
     ):
         change(edit)
         with pytest.raises(FileError, match=message):

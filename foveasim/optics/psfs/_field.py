@@ -8,7 +8,6 @@ of the field are computed. Frequencies are in units of ``1 / u``: u is λN, or t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,6 @@ from foveasim.units import um_from_nm
 
 if TYPE_CHECKING:
     from foveasim.optics.psfs._grid import PSFGrid
-    from foveasim.optics.pupils import Pupil
 
 #: Fraction of the light within the radius that counts as blur, and this radius in an Airy pattern, in λN.
 BLUR_FRACTION, AIRY_LAMBDA_N = 0.95, 4.25
@@ -58,11 +56,6 @@ class FieldPSFs:
         return cls(psfs, f_number)
 
     @property
-    def pupils(self) -> Sequence[Pupil]:
-        """No pupils: they are part of the PSFs."""
-        return ()
-
-    @property
     def is_achromatic(self) -> bool:
         """Whether no samples of a pupil depend on the wavelength: there are none."""
         return True
@@ -74,7 +67,7 @@ class FieldPSFs:
 
     def unit_um(self, wavelength_nm: Any) -> Any:
         """Return λN, or two samples if these are coarser."""
-        return np.maximum(um_from_nm(wavelength_nm) * self.f_number, 2.0 * self.psfs.pitch_um)
+        return self.psfs.cut_off_um(um_from_nm(wavelength_nm) * self.f_number)
 
     def transmittance(self, wavelength_nm: float) -> float:  # noqa: ARG002
         """Return the transmitted power; that of the lens follows from its f-number."""
@@ -270,7 +263,7 @@ class FieldPSFs:
     ) -> NDArray[np.floating[Any]]:
         """Sample the PSF at multiples of u/2, up to ``radius`` of them along each axis."""
         # Fewer frequencies than for interpolation suffice, so that copies of the PSF, 2 n multiples apart, do not overlap it.
-        half = 0.5 * max(self.psfs.psf.shape[2:]) * self.psfs.pitch_um / (0.5 * float(self.unit_um(wavelength_nm)))
+        half = self._turned_side * self.psfs.pitch_um / float(self.unit_um(wavelength_nm))
         n = min(n_across, math.ceil(0.5 * (radius + half)) + 1)
         otf = self.compute_otf(wavelength_nm, n, n, field_um, np.float64)
         at = np.arange(-radius, radius + 1) * (-0.5 / n)

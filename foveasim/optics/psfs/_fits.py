@@ -9,8 +9,6 @@ columns ``x_um``, ``y_um`` and, as an option, ``relative_illumination`` with n_w
 
 from __future__ import annotations
 
-import math
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -18,39 +16,29 @@ import numpy as np
 
 from foveasim._core.extras import import_optional
 from foveasim._io.formats import FileFormat, FormatError
-from foveasim._io.rasters import check_size
+from foveasim._io.rasters.fits import MAGIC, open_fits, read_image
 from foveasim.optics.psfs._formats import PSF_FORMATS, choices_of, require
 from foveasim.optics.psfs._grid import MAX_POINTS, PSFGrid
 
-MAGIC = b"SIMPLE  ="
 #: Keywords by the names of the conventions.
 KEYWORDS = {"image": "IMAGE", "first_row": "FIRSTROW", "samples": "SAMPLES"}
 
 
 def read(path: Path) -> PSFGrid:
     """Read the image and the tables."""
-    fits = import_optional(path, "astropy.io.fits")
-    n_bytes = path.stat().st_size
-    with (
-        warnings.catch_warnings(),
-        path.open("rb") as binary,  # astropy does not close truncated files
-        fits.open(binary, mode="readonly", memmap=False, disable_image_compression=True, lazy_load_hdus=True) as file,
-    ):
-        warnings.simplefilter("ignore")  # warns about deviations from the standard
+    with open_fits(path) as file:
         header = file[0].header
         require(header, ("PITCH_UM",))
         pitch_um = header["PITCH_UM"]
         if isinstance(pitch_um, bool) or not isinstance(pitch_um, int | float):
             raise FormatError(f"has the invalid value PITCH_UM = {pitch_um!r:.20}, expected a number")
-        itemsize = abs(int(header["BITPIX"])) // 8
-        check_size(file[0].shape, max(itemsize, 1), n_bytes)
-        if not file[0].shape or math.prod(file[0].shape) * itemsize > n_bytes:
-            raise FormatError("is truncated, or contains no image")
+        if not file[0].shape:
+            raise FormatError("contains no image")
         points, waves = (
             _columns(file, *names) for names in (("POINTS", "x_um", "y_um"), ("WAVELENGTHS", "wavelength_nm"))
         )
         conventions = choices_of({name: header.get(keyword) for name, keyword in KEYWORDS.items()})
-        psf = np.asarray(file[0].data)
+        psf = read_image(file[0], path.stat().st_size)
         psf = psf.astype(psf.dtype.newbyteorder("="))
     fraction = points.get("relative_illumination")
     return PSFGrid.from_arrays(

@@ -72,9 +72,10 @@ class PSFGrid:
 
     Notes
     -----
-    Between the points, PSFs without the displacement of their centroids are interpolated by cubic splines, and displaced by
-    interpolated centroids. Those on a radius are turned around the axis. Beyond the outermost points, the PSF is that of
-    the nearest position within. Frequencies above the cut-off of the lens, ``1 / λN``, are removed.
+    Between the points, PSFs without the displacement of their centroids are interpolated, and displaced by interpolated
+    centroids: by cubic splines, or linearly if distances of points differ by more than a factor of 2. Those on a radius are
+    turned around the axis. Beyond the outermost points, the PSF is that of the nearest position within. Frequencies above the
+    cut-off of the lens, ``1 / λN``, are removed.
 
     Examples
     --------
@@ -126,7 +127,7 @@ class PSFGrid:
             if not (fraction.mean(axis=1) > 0.0).all():
                 raise ParameterError("relative_illumination", "must be above 0 at each point for one wavelength")
             set_(self, "relative_illumination", read_only(fraction.copy()))
-        if len(self.axes) == 1 and psf.size > MAX_TURNED_VALUES:  # the points form a grid or a radius
+        if self.is_radial and psf.size > MAX_TURNED_VALUES:
             raise ParameterError("psf", f"must have at most {MAX_TURNED_VALUES} values on a radius, got {psf.size}")
         beyond = float(self.beyond_fraction.max())
         if beyond > MAX_BEYOND:
@@ -292,6 +293,10 @@ class PSFGrid:
             for axis, at in zip(self.axes, (self.x_um, self.y_um), strict=True)
         )
         return np.lexsort((column, row))
+
+    def cut_off_um(self, lambda_n_um: Any) -> Any:
+        """Return the period of the cut-off frequency: λN, or two samples if these are coarser."""
+        return np.maximum(lambda_n_um, 2.0 * self.pitch_um)
 
     @property
     def azimuth_rad(self) -> float:
