@@ -14,7 +14,7 @@ LENS = fs.Optics(focal_length_mm=8.0, f_number=4.0, padding="zero", oversample=1
 #: Pitch of the scene for cells of 0.45 λN, in µm.
 PITCH_UM = 122.0
 #: Aberrations at the corners, µm, which blur by 6 cells.
-CORNER_UM = {"coma_um": 0.1, "astigmatism_um": 0.07, "field_curvature_um": 0.05}
+CORNER_UM = {"coma_um": 0.14, "astigmatism_um": 0.098, "field_curvature_um": 0.07}
 N_REPEATS = 4
 
 
