@@ -59,7 +59,7 @@ DIMENSIONLESS = {
 }  # fmt: skip
 #: Names in private functions, in cells, pitches, steps or aperture radii as their docstrings specify.
 INTERNAL = {
-    "along_y", "at_points", "fields", "profiles", "at", "axes", "before", "blur_cells", "blur_lambda_n", "bound", "bounds", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
+    "nodes", "slopes", "variance_slope", "along_y", "at_points", "fields", "profiles", "at", "axes", "before", "blur_cells", "blur_lambda_n", "bound", "bounds", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
     "n_across", "n_source_cells", "moments", "new_radius", "node", "norm", "off_diagonal", "one", "other", "per_step", "pixel", "plane", "points", "quantiles", "r2", "radius", "right", "row", "rows", "s_x", "s_y", "scale", "screen", "side", "sigma", "slope", "spread", "start", "tables_at",
     "tangent2_x", "tangent2_y", "threshold", "to_step", "u", "upper", "v", "x", "x2", "xy", "y", "y2", "sampling", "step", "t", "weigh", "window",
     "bounds_db", "difference_db", "illumination", "spectra", "srgb", "white_xyz", "xyz", "centre", "centres", "circles", "column_x", "compute", "discs", "maps", "opening", "photodiode", "position", "half", "lines_x", "lines_y", "ordered", "phase", "radians", "radians_x", "rho", "row_y", "segments", "shift", "tangents",
@@ -285,7 +285,6 @@ ELECTRONIC = {
 #: Modules that show or transfer parameters, or limit charges at the full well, with those that they read.
 READS_PARAMETERS = {
     "view/notebook/_objects.py": None,  # table of parameters
-    "learn/readout.py": {"well_e", "v_sat_v"},  # the full well and the transition levels in volts, as tensors
     "reconstruct/estimates.py": {"well_e"},  # charges at the full well
     "testing/_effects.py": {"nominal_dark_e_per_s"},  # an independent mean of the dark charge
 }

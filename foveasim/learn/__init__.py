@@ -20,6 +20,7 @@ __all__ = [
     "Outlines",
     "PowerCells",
     "Readout",
+    "SensorLayer",
     "barrier",
     "capture",
     "generated",
@@ -31,6 +32,7 @@ if TYPE_CHECKING or find_spec("torch") is not None:
     from foveasim.learn.distortion import undistort
     from foveasim.learn.imaging import Imaging
     from foveasim.learn.integral import site_power
+    from foveasim.learn.layer import SensorLayer
     from foveasim.learn.mesh import Mesh
     from foveasim.learn.model import Model, capture
     from foveasim.learn.outlines import Outlines

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,9 +17,13 @@ from foveasim.errors import ParameterError, type_name
 MAX_HALVINGS = 8
 
 
-def check_tensor(name: str, value: object, shape: Sequence[int | None], description: str = "") -> Tensor:
+def check_tensor(
+    name: str, value: object, shape: Sequence[int | None], description: str = "", *, any_device: bool = False
+) -> Tensor:
     """
-    Check that a value is a floating-point tensor of a shape on the CPU, and return it.
+    Check that a value is a floating-point tensor of a shape, and return it.
+
+    It must be on the CPU unless any device is allowed.
 
     ``None`` in the shape stands for any size; a leading ``...`` in the description for further axes, which
     the caller flattens.
@@ -29,7 +34,7 @@ def check_tensor(name: str, value: object, shape: Sequence[int | None], descript
         raise ParameterError(
             name, f"must be a tensor of floating-point numbers, got {value.dtype}", hint="use .double() or .float()"
         )
-    if value.device.type != "cpu":
+    if not any_device and value.device.type != "cpu":
         raise ParameterError(
             name, f"must be on the CPU, got a tensor on {value.device}", hint="use .cpu(); gradients follow it back"
         )
@@ -42,7 +47,120 @@ def check_tensor(name: str, value: object, shape: Sequence[int | None], descript
 
 def as_array(tensor: Tensor) -> NDArray[Any]:
     """Return the numbers of a tensor as a C-contiguous array, without a copy where possible."""
-    return np.ascontiguousarray(tensor.detach().numpy())
+    return np.ascontiguousarray(tensor.detach().cpu().numpy())
+
+
+class Constants:
+    """
+    Constant arrays as tensors, on the devices and with the dtypes of other tensors.
+
+    Modules keep them in double precision, and not among their buffers.
+    """
+
+    def __init__(self, **values: Any) -> None:
+        self._values = {name: np.asarray(value) for name, value in values.items()}
+        self._tensors: dict[tuple[str, torch.device, torch.dtype], Tensor] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_tensors": {}}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
+    def add(self, **values: Any) -> None:
+        """Add arrays."""
+        self._values.update((name, np.asarray(value)) for name, value in values.items())
+
+    def get(self, name: str, like: Tensor, compute: Callable[[], Any] | None = None) -> Tensor:
+        """
+        Return an array as a tensor on the device of another one.
+
+        ``compute`` returns the array if it is not yet known. Floating-point and complex numbers have the precision of ``like``,
+        integers their own.
+        """
+        key = name, like.device, like.dtype
+        found = self._tensors.get(key)
+        if found is None:
+            if name not in self._values:
+                assert compute is not None
+                self.add(**{name: compute()})
+            values = self._values[name]
+            precision = like.dtype.to_complex() if values.dtype.kind == "c" else like.dtype.to_real()
+            with torch.inference_mode(mode=False):
+                found = torch.from_numpy(np.array(values)).to(like.device)
+                if values.dtype.kind in "fc":
+                    found = found.to(precision)
+            if type(found) is Tensor:  # none of a tracer
+                self._tensors[key] = found
+        return found
+
+
+class SparseMap:
+    """
+    Multiplication of rows (..., n) by a sparse matrix (m, n).
+
+    Differentiable any number of times: the derivative is the product with the transposed matrix.
+    """
+
+    def __init__(self, matrix: Any) -> None:
+        rows = matrix.tocsr()
+        rows.sum_duplicates()
+        self.shape = rows.shape
+        self._parts: list[Any] = [rows, rows.T.tocsr()]
+        self._tensors: dict[Any, Tensor] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_tensors": {}}
+
+    @property
+    def entries(self) -> Any:
+        """Elements of the matrix, in COO format with int64 indices."""
+        found = self._parts[0].tocoo()
+        found.coords = tuple(np.asarray(each, np.int64) for each in found.coords)
+        return found
+
+    def tensor(self, like: Tensor, *, is_transposed: bool = False) -> Tensor:
+        """Return the matrix, or the transposed one, as a CSR tensor on the device of another one."""
+        key = is_transposed, like.device, like.dtype
+        found = self._tensors.get(key)
+        if found is None:
+            part = self._parts[int(is_transposed)]
+            dtype = np.int32 if part.nnz < 2**31 else np.int64
+            index = [torch.from_numpy(np.array(each, dtype)) for each in (part.indptr, part.indices)]
+            data = torch.from_numpy(np.array(part.data)).to(like.dtype)
+            with torch.inference_mode(mode=False), warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
+                found = torch.sparse_csr_tensor(*index, data, part.shape, device=like.device, check_invariants=False)
+            self._tensors[key] = found
+        return found
+
+    def apply(self, values: Tensor) -> Tensor:
+        """Return the products (..., m) of rows (..., n)."""
+        rows = values.reshape(-1, self.shape[1])
+        found = _Product.apply(rows, self, False)  # type: ignore[no-untyped-call]
+        return found.reshape(*values.shape[:-1], self.shape[0])  # type: ignore[no-any-return]
+
+
+class _Product(torch.autograd.Function):
+    """Products of rows with a sparse matrix, or with the transposed one."""
+
+    @staticmethod
+    def forward(rows: Tensor, matrix: SparseMap, is_transposed: bool) -> Tensor:
+        if rows.device.type == "meta":
+            return rows.new_empty(rows.shape[0], matrix.shape[1 if is_transposed else 0])
+        sparse = matrix.tensor(rows, is_transposed=is_transposed)
+        if rows.device.type == "cpu" and rows.shape[0]:  # without copies of the rows
+            return torch.stack([torch.mv(sparse, row) for row in rows])
+        return torch.sparse.mm(sparse, rows.T).T
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        del output
+        _, ctx.matrix, ctx.is_transposed = inputs
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        return _Product.apply(gradients[0], ctx.matrix, not ctx.is_transposed), None, None  # type: ignore[no-untyped-call]
 
 
 def constant(values: Any) -> Tensor:

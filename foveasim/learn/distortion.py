@@ -103,7 +103,7 @@ def undistort(lens: Lens, points: Tensor, coefficients: Tensor | None = None, na
     Derivatives are central differences of fourth order of the lens model, which is smooth on the scale of its focal
     length. Their relative error is about 1e-9.
     """
-    points = check_tensor("points", points, (None, 2))
+    points = check_tensor("points", points, (None, 2), any_device=True)
     names = tuple(names)
     known = coefficient_names(lens)
     for name in names:
@@ -112,7 +112,7 @@ def undistort(lens: Lens, points: Tensor, coefficients: Tensor | None = None, na
             raise ParameterError("names", f"must be coefficients of {type(lens).__name__}", name, hint=hint)
     if coefficients is None:
         coefficients = torch.tensor(coefficient_values(lens, names), dtype=torch.float64)
-    coefficients = check_tensor("coefficients", coefficients, (len(names),), ", one per name")
+    coefficients = check_tensor("coefficients", coefficients, (len(names),), ", one per name", any_device=True)
     return _Undistort.apply(points, coefficients, lens, names)  # type: ignore[no-any-return, no-untyped-call]
 
 
@@ -124,14 +124,14 @@ class _Undistort(torch.autograd.Function):
         ctx.save_for_backward(points, coefficients)
         ctx.lens, ctx.names = lens, names
         current = with_coefficients(lens, names, coefficients.detach().tolist())
-        return torch.from_numpy(current.undistort(as_array(points).astype(np.float64))).to(points.dtype)
+        return torch.from_numpy(np.array(current.undistort(as_array(points).astype(np.float64)))).to(points)
 
     @staticmethod
     @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
         points, coefficients = ctx.saved_tensors
         weights, xy_um = as_array(gradients[0]).astype(np.float64), as_array(points).astype(np.float64)
-        values = coefficients.detach().numpy()
+        values = as_array(coefficients).astype(np.float64)
         lens = with_coefficients(ctx.lens, ctx.names, values)
         of_points = of_coefficients = None
         if ctx.needs_input_grad[0]:
@@ -143,7 +143,7 @@ class _Undistort(torch.autograd.Function):
                     return lens.undistort(xy_um + t * np.eye(2)[axis], outside="mask")
 
                 columns.append((_differentiate(moved, step_um) * weights).sum(axis=1))
-            of_points = torch.from_numpy(np.stack(columns, axis=1)).to(points.dtype)
+            of_points = torch.from_numpy(np.stack(columns, axis=1)).to(points)
         if ctx.needs_input_grad[1]:
             found = []
             for k, value in enumerate(values):
@@ -154,7 +154,7 @@ class _Undistort(torch.autograd.Function):
 
                 step = COEFFICIENT_STEP * max(abs(float(value)), _scale(ctx.lens, ctx.names[k]))
                 found.append(float((_differentiate(shifted, step) * weights).sum()))
-            of_coefficients = torch.tensor(found, dtype=coefficients.dtype)
+            of_coefficients = torch.tensor(found, dtype=coefficients.dtype, device=coefficients.device)
         return of_points, of_coefficients, None, None
 
 

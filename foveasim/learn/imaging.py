@@ -1,15 +1,15 @@
 """
 Optics as a differentiable function of scene, spectral weights and aberrations.
 
-Maps are those of :meth:`foveasim.Optics.weighted_maps` in float64. The transforms are those of torch, so that
-derivatives of any
-order exist; only the transfer functions of a lens without variables come from the kernels of the simulator.
+Maps are those of :meth:`foveasim.Optics.weighted_maps`, on the device and with the precision of the pictures. The transforms
+are those of torch, so that derivatives of any order exist; only the transfer functions of a lens without variables come from
+the kernels of the simulator.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -24,7 +24,7 @@ from foveasim._core.validation import Floats, Ints
 from foveasim._io.mapped_files import in_memory
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, SceneLike
-from foveasim.learn._tensors import check_tensor, constant
+from foveasim.learn._tensors import Constants, check_tensor, constant
 from foveasim.optics import Optics, PupilImage, Seidel, Zernike, zernike
 from foveasim.optics._aperture import PUPIL_POINTS, Aperture, overlaps
 from foveasim.optics._imaging import PatchExtent
@@ -36,6 +36,8 @@ __all__ = ["VARIABLES", "Imaging"]
 VARIABLES = ("zernike", "seidel", "defocus", "pupil")
 #: Isoplanatic patches along each side of the picture by default.
 PATCHES = 5
+#: Number of cells, of all padded basis images, that a processor transforms at once: they stay in its cache.
+MAX_PART = 2**21
 #: Coefficients of Seidel aberrations, in the order of the tensor.
 SEIDEL_NAMES = ("spherical_um", "coma_um", "astigmatism_um", "field_curvature_um")
 #: Largest number of aliases per side of a lens with variables; more would take minutes.
@@ -108,14 +110,36 @@ class Imaging(nn.Module):
         self._imaging, self._tables_at = self._optics.imaging(scene, np.eye(scene.wavelength_nm.size))
         # Weights of the modes over the field, the mean first.
         weights = [np.ones(scene.basis.shape[1:]), *(each.at_pixels() for each in self._imaging.field_weights)]
-        self.register_buffer("_field_weights", constant(np.stack(weights)))
-        self.register_buffer("_irradiance", constant(self._imaging.irradiance_w_m2))
+        self._n_modes = len(weights)
+        self._constants = Constants(field_weights=np.stack(weights), irradiance=self._imaging.irradiance_w_m2)
         self.grid: Grid = self._optics.image_grids(scene)[0][0]
         self._n_patches = self._optics.n_patches
         for name in self.wrt:
             setattr(self, name, nn.Parameter(constant(self._start(name))))
-        self._fixed: dict[int, Tensor] = {}
         self._computed: dict[Any, Any] = {}
+        self._patches = self._extents()
+        self._cells = [_slices(self._imaging.patch_cells(*each[1:])) for each in self._patches]
+        self._sources = [_Padding.of(*each[1:], self._imaging.patch_window(*each[1:])) for each in self._patches]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in ("_imaging", "_tables_at")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._imaging, self._tables_at = self._optics.imaging(self._scene, np.eye(self._scene.wavelength_nm.size))
+
+    @property
+    def has_patches(self) -> bool:
+        """Whether the picture is imaged in isoplanatic patches."""
+        return self._n_patches != (1, 1)
+
+    @property
+    def is_invariant(self) -> bool:
+        """Whether relative illumination and PSF are equal everywhere."""
+        if self.has_patches or self._n_modes > 1:
+            return False
+        _, rows, columns = self._patches[0]
+        return bool(np.ptp(self._imaging.patch_window(rows, columns)) == 0.0)
 
     def __repr__(self) -> str:
         return f"Imaging({self._optics!r}, variables: {', '.join(self.wrt) or 'none'})"
@@ -165,7 +189,7 @@ class Imaging(nn.Module):
         ParameterError
             When a value is out of range, such as a transmission above 1.
         """
-        values = {name: getattr(self, name).detach().numpy() for name in self.wrt}
+        values = {name: getattr(self, name).detach().double().cpu().numpy() for name in self.wrt}
         lens = self._optics
         if "zernike" in values or "defocus" in values:
             start = lens.zernike or Zernike(coefficients={4: 0.0})
@@ -200,38 +224,103 @@ class Imaging(nn.Module):
 
         Returns
         -------
-        maps : (..., n_output, k n_y, k n_x) float64 tensor
-            Sums over the basis images, with ``optics.oversample`` k; cell means, bottom row first.
+        maps : (..., n_output, k n_y, k n_x) tensor
+            Sums over the basis images, with ``optics.oversample`` k; cell means, bottom row first. On the device and with the
+            dtype of the basis images; float64 for those of the scene.
+        """
+        if basis is None:
+            basis = torch.from_numpy(np.array(in_memory(self._scene.basis), np.float64))
+            basis = basis if weights is None else basis.to(weights.device)
+        return self.filtered(basis, self.transfer(weights))
+
+    def transfer(self, weights: Tensor | None = None) -> list[Tensor]:
+        """
+        Compute the transfer functions from basis images to weighted sums of maps.
+
+        Parameters
+        ----------
+        weights : (n_output, n_wavelength) tensor, optional
+            As for :meth:`forward`.
+
+        Returns
+        -------
+        list of (n_output, n_image, n_row, n_column) complex tensors
+            For :meth:`filtered`; one for each isoplanatic patch. Images are the pairs of a basis image and a mode of the field.
         """
         n_waves = self._scene.wavelength_nm.size
         if weights is None:
             weights = torch.eye(n_waves, dtype=torch.float64)
-        weights = check_tensor("weights", weights, (None, n_waves), ", one column per wavelength").double()
+        weights = check_tensor("weights", weights, (None, n_waves), ", one column per wavelength", any_device=True)
+        per_image = weights.tile(1, self._n_modes)[:, None, :] * self._constants.get("irradiance", weights)
+        found = []
+        for number, (field_um, rows, columns) in enumerate(self._patches):
+            factors, transmittance = self._factors(number, field_um, rows.cells.size, columns.cells.size, weights)
+            found.append(torch.einsum("cbk,kyx->cbyx", (per_image * transmittance).to(factors.dtype), factors))
+        return found
+
+    def split(self, n_scenes: int, device: torch.device) -> list[slice]:
+        """Return the parts of a batch that are imaged at once."""
+        n_cells = sum(rows.cells.size * columns.cells.size for _, rows, columns in self._patches)
+        n_cells *= self._scene.basis.shape[0] * self._n_modes * self._imaging.oversample**2
+        n = max(1, MAX_PART // n_cells) if device.type == "cpu" else n_scenes
+        return [slice(k, min(k + n, n_scenes)) for k in range(0, n_scenes, n)] or [slice(0, 0)]
+
+    def filtered(self, basis: Tensor, transfer: Sequence[Tensor], shift: Tensor | None = None) -> Tensor:
+        """
+        Compute maps with transfer functions.
+
+        Parameters
+        ----------
+        basis : (..., n_basis, n_y, n_x) tensor
+            Basis images of scenes.
+        transfer : list of tensors
+            From :meth:`transfer`.
+        shift : (n_scene, 2) tensor, optional
+            Displacement (x, y) of the point of each map at which the position before was, in cells: its spectrum is multiplied
+            by a phase. Maps continue beyond their edges as the padding, and periodically beyond it.
+
+        Returns
+        -------
+        maps : (..., n_output, k n_y, k n_x) tensor
+            As for :meth:`forward`.
+        """
         shape = self._scene.basis.shape
-        if basis is None:
-            basis = torch.from_numpy(np.array(in_memory(self._scene.basis), np.float64))
         if not isinstance(basis, Tensor) or basis.ndim < 3:
-            check_tensor("basis", basis, shape)
-        flat = check_tensor("basis", basis.reshape(-1, *basis.shape[-3:]), (None, *shape), ", as the scene").double()
-        # Each pair of an image and a mode is an image, and each pair of a wavelength and a mode a wavelength.
-        n_modes = self._field_weights.shape[0]
-        if n_modes > 1:
-            flat = (flat[:, :, None] * self._field_weights).flatten(1, 2)
-        per_basis = weights.tile(1, n_modes)[:, None, :] * self._irradiance
-        k, (n_y, n_x) = self._imaging.oversample, shape[1:]
-        maps = torch.zeros(flat.shape[0], weights.shape[0], k * n_y, k * n_x, dtype=torch.float64)
-        for number, (field_um, rows, columns) in enumerate(self._extents()):
-            factors, transmittance = self._factors(number, field_um, rows.cells.size, columns.cells.size)
-            found = self._transform(flat, rows, columns, factors, per_basis * transmittance)
-            (to_y, to_x), (from_y, from_x) = self._imaging.patch_cells(rows, columns)
-            inner = found[..., torch.from_numpy(from_y), torch.from_numpy(from_x)]
-            if self._n_patches == (1, 1):
-                maps = inner
-            else:
-                patch = torch.zeros_like(maps)
-                patch[..., torch.from_numpy(to_y), torch.from_numpy(to_x)] = inner
-                maps = maps + patch
+            check_tensor("basis", basis, shape, any_device=True)
+        flat = basis.reshape(-1, *basis.shape[-3:])
+        check_tensor("basis", flat, (None, *shape), ", as the scene", any_device=True)
+        parts = [
+            self._filtered(flat[part], transfer, None if shift is None else shift[part])
+            for part in self.split(flat.shape[0], flat.device)
+        ]
+        maps = parts[0] if len(parts) == 1 else torch.cat(parts)
         return maps.reshape(*basis.shape[:-3], *maps.shape[1:])
+
+    def _filtered(self, basis: Tensor, transfer: Sequence[Tensor], shift: Tensor | None) -> Tensor:
+        maps = None
+        for number in range(len(self._patches)):
+            (to_y, to_x), (from_y, from_x) = self._cells[number]
+            found = self._transform(basis, number, transfer[number], shift, from_y)[..., from_x]
+            if not self.has_patches:
+                return found
+            n_y, n_x = self.grid.shape
+            found = nn.functional.pad(found, (to_x.start, n_x - to_x.stop, to_y.start, n_y - to_y.stop))
+            maps = found if maps is None else maps + found
+        assert maps is not None
+        return maps
+
+    def padded(self, basis: Tensor, transfer: Sequence[Tensor], shift: Tensor | None = None) -> Tensor:
+        """
+        Compute maps as :meth:`filtered`, with all columns of their padding.
+
+        See :attr:`padded_columns`. Not for isoplanatic patches. ``basis`` (n_scene, n_basis, n_y, n_x).
+        """
+        return self._transform(basis, 0, transfer[0], shift, self._cells[0][1][0])
+
+    @property
+    def padded_columns(self) -> tuple[int, int]:
+        """Number of columns of a padded map, and the first one of the map."""
+        return self._imaging.oversample * self._patches[0][2].cells.size, self._cells[0][1][1].start
 
     def _extents(self) -> list[tuple[tuple[float, float], PatchExtent, PatchExtent]]:
         """Return field position and extents of all patches, or of the padded picture."""
@@ -247,28 +336,39 @@ class Imaging(nn.Module):
         )
         return [((0.0, 0.0), rows, columns)]
 
-    def _transform(
-        self, basis: Tensor, rows: PatchExtent, columns: PatchExtent, factors: Tensor, weights: Tensor
-    ) -> Tensor:
-        """Return maps (n_scene, n_output, k n_row, k n_column) of the cells of a patch."""
+    def _transform(self, basis: Tensor, number: int, transfer: Tensor, shift: Tensor | None, of_rows: slice) -> Tensor:
+        """Return some rows of the maps (n_scene, n_output, n_row, k n_column) of a patch."""
+        # Each pair of an image and a mode is an image.
+        if self._n_modes > 1:
+            basis = (basis[:, :, None] * self._constants.get("field_weights", basis)).flatten(1, 2)
+        rows, columns = self._patches[number][1:]
         k, (n_y, n_x) = self._imaging.oversample, (rows.cells.size, columns.cells.size)
-        window = constant(self._imaging.patch_window(rows, columns))
-        picture = basis[..., torch.from_numpy(rows.sources), :][..., torch.from_numpy(columns.sources)] * window
-        before = rows.pixels.start, columns.pixels.start
-        after = n_y - rows.pixels.stop, n_x - columns.pixels.stop
-        padded = nn.functional.pad(picture, (before[1], after[1], before[0], after[0]))
+        get = partial(self._constants.get, like=basis)
+        padded = self._sources[number].apply(basis)
         if k == 1:
             spectra = torch.fft.rfft2(padded)
         else:
             # Points at the centres of source pixels have a periodic spectrum; see foveasim.optics._transform.
             spectra = torch.fft.fft2(padded)
-            spectra = spectra[..., torch.arange(k * n_y) % n_y, :][..., torch.arange(k * n_x // 2 + 1) % n_x]
-            cycles_x, cycles_y = self._cycles(n_y, n_x)
-            shift = -math.pi * (k - 1)
-            phase = torch.from_numpy(np.exp(1j * shift * cycles_y)[:, np.newaxis] * np.exp(1j * shift * cycles_x))
-            spectra = spectra * (k * k * phase)
-        filtered = torch.einsum("cbk,kyx,sbyx->scyx", weights.to(factors.dtype), factors, spectra)
-        return torch.fft.irfft2(filtered, s=(k * n_y, k * n_x))
+            fine_y = get(f"fine y {number}", compute=lambda: np.arange(k * n_y) % n_y)
+            spectra = spectra[
+                ..., fine_y[:, None], get(f"fine x {number}", compute=lambda: np.arange(k * n_x // 2 + 1) % n_x)
+            ]
+            spectra = spectra * get(f"phase {number}", compute=lambda: self._phase(n_y, n_x))
+        if shift is not None:
+            cycles = get(f"cycles x {number}", compute=lambda: self._cycles(n_y, n_x)[0])
+            spectra = spectra * _shifted(cycles, shift[:, 0])[:, None, None, :]
+            cycles = get(f"cycles y {number}", compute=lambda: self._cycles(n_y, n_x)[1])
+            spectra = spectra * _shifted(cycles, shift[:, 1])[:, None, :, None]
+        # Rows that are not needed are not transformed along x.
+        found = torch.fft.ifft(_products(spectra, transfer), dim=-2)[..., of_rows, :]
+        return torch.fft.irfft(found, k * n_x)
+
+    def _phase(self, n_y: int, n_x: int) -> Any:
+        """Return the factors of spectra of points on fine cells."""
+        k, (cycles_x, cycles_y) = self._imaging.oversample, self._cycles(n_y, n_x)
+        shift = -math.pi * (k - 1)
+        return k * k * np.exp(1j * shift * cycles_y)[:, np.newaxis] * np.exp(1j * shift * cycles_x)
 
     def _cycles(self, n_y: int, n_x: int) -> tuple[Floats, Floats]:
         """Return the frequencies along x and y of the fine cells, in cycles per cell."""
@@ -278,28 +378,32 @@ class Imaging(nn.Module):
 
     # -- transfer functions -------------------------------------------------------------------------------------------
 
-    def _factors(self, number: int, field_um: tuple[float, float], n_y: int, n_x: int) -> tuple[Tensor, Tensor]:
+    def _factors(
+        self, number: int, field_um: tuple[float, float], n_y: int, n_x: int, like: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """
         Return the transfer function of each wavelength, and the change of its transmittance.
 
         (n_wavelength, k n_y, k n_x // 2 + 1) and (n_wavelength,).
         """
-        n_waves = self._irradiance.shape[1]
         if self.wrt:
             tables, transmittance, per_step = self._otf_tables(field_um)
             return self._sample_tables(tables, per_step, n_y, n_x), transmittance
-        if number not in self._fixed:
-            k = self._imaging.oversample
-            transform = self._imaging.transform(np.arange(n_y), np.arange(n_x), (n_y, n_x))
-            tables_at, full = self._tables_at(field_um), np.zeros((n_waves, k * n_y, k * n_x // 2 + 1), complex)
-            for wave, weight in enumerate(np.eye(n_waves)):
-                columns = transform.complete(transform.factor(*tables_at(weight)))
-                of_row = np.arange(k * n_y)
-                if columns.shape[1] < k * n_y:  # even along y
-                    of_row = np.minimum(of_row, k * n_y - of_row)
-                full[wave, :, : columns.shape[0]] = columns[:, of_row].T
-            self._fixed[number] = torch.from_numpy(full)
-        return self._fixed[number], torch.ones(n_waves, dtype=torch.float64)
+        factors = self._constants.get(f"factors {number}", like, lambda: self._fixed_factors(field_um, n_y, n_x))
+        return factors, like.new_ones(factors.shape[0])
+
+    def _fixed_factors(self, field_um: tuple[float, float], n_y: int, n_x: int) -> Any:
+        """Return the transfer functions of a lens without variables."""
+        k, n_waves = self._imaging.oversample, self._imaging.irradiance_w_m2.shape[1]
+        transform = self._imaging.transform(np.arange(n_y), np.arange(n_x), (n_y, n_x))
+        tables_at, full = self._tables_at(field_um), np.zeros((n_waves, k * n_y, k * n_x // 2 + 1), complex)
+        for wave, weight in enumerate(np.eye(n_waves)):
+            columns = transform.complete(transform.factor(*tables_at(weight)))
+            of_row = np.arange(k * n_y)
+            if columns.shape[1] < k * n_y:  # even along y
+                of_row = np.minimum(of_row, k * n_y - of_row)
+            full[wave, :, : columns.shape[0]] = columns[:, of_row].T
+        return full
 
     def _otf_tables(self, field_um: tuple[float, float]) -> tuple[Tensor, Tensor, float]:
         """Return OTF tables over (f_y, f_x), relative transmittances, and their step."""
@@ -319,10 +423,12 @@ class Imaging(nn.Module):
         self, wave_nm: float, n_across: float, n_lags: int, field_um: tuple[float, float]
     ) -> tuple[Tensor, Tensor]:
         """Return the OTF at integer lags, and the relative transmittance."""
+        like = getattr(self, self.wrt[0])
         samples, at, power = self._once(
             "samples", wave_nm, field_um, lambda: self._aperture.samples(wave_nm, n_across, field_um)
         )
-        amplitude, change = torch.from_numpy(samples), torch.ones((), dtype=torch.float64)
+        amplitude = self._constants.get(f"samples {wave_nm} {field_um}", like, lambda: samples)
+        change = like.new_ones(())
         if "pupil" in self.wrt:
             amplitude, change = self._pupil_amplitude(wave_nm, n_across, samples, at, field_um)
         path_um = self._path_change_um(at, field_um)
@@ -334,33 +440,37 @@ class Imaging(nn.Module):
         wave = torch.fft.fft2(amplitude, (size, size))
         otf = torch.fft.fft2(wave.real**2 + wave.imag**2) / (size * size * power * change)
         k = min(n_lags, n - 1)
-        lags = torch.arange(-k, k + 1) % size
+        lags = torch.arange(-k, k + 1, device=like.device) % size
         inner = otf[lags][:, lags]
         # OTF(0) = 1 conserves energy exactly.
-        centre = torch.zeros(2 * k + 1, 2 * k + 1, dtype=torch.bool)
+        centre = torch.zeros(2 * k + 1, 2 * k + 1, dtype=torch.bool, device=like.device)
         centre[k, k] = True
-        inner = torch.where(centre, torch.ones((), dtype=inner.dtype), inner)
+        inner = torch.where(centre, inner.new_ones(()), inner)
         return nn.functional.pad(inner, (n_lags - k,) * 4), change
 
     def _pupil_amplitude(
         self, wave_nm: float, n_across: float, samples: Any, at: Floats, field_um: tuple[float, float]
     ) -> tuple[Tensor, Tensor]:
         """Return amplitude and relative transmittance of the current pupil."""
-        n = samples.shape[0]
+        n, n_pixels, pupil = samples.shape[0], self.pupil.shape[0], self.pupil
         # The shape of the aperture without the picture: the unit disc.
         n_fine = self._aperture._sample_pupil(wave_nm, max(PUPIL_POINTS, n)).shape[0]  # noqa: SLF001
         position = (np.arange(n_fine) + 0.5) * (2.0 / n_fine) - 1.0
-        disc = constant(position**2 + position[:, np.newaxis] ** 2 <= 1.0)
-        n_pixels = self.pupil.shape[0]
+        get, key = partial(self._constants.get, like=pupil), f"{wave_nm} {n} {n_fine} {field_um}"
+        disc = get(f"disc {key}", compute=lambda: (position**2 + position[:, np.newaxis] ** 2 <= 1.0).astype(float))
         # As in PupilImage, whose rows count from the top: points on a border belong to the pixel below.
         row, column = (
             np.clip(np.floor(0.5 * n_pixels * (1.0 + at_point)), 0, n_pixels - 1).astype(np.int64)
             for at_point in (-position, position)
         )
-        fine = disc * self.pupil[torch.from_numpy(n_pixels - 1 - row)][:, torch.from_numpy(column)]
-        mean = constant(overlaps(n, 2.0 / n_across, n_fine, 2.0 / n_fine).toarray())
+        of_row, of_column = (
+            get(f"{name} {key}", compute=partial(np.asarray, index))
+            for name, index in (("row", n_pixels - 1 - row), ("column", column))
+        )
+        fine = disc * pupil[of_row][:, of_column]
+        mean = get(f"mean {key}", compute=lambda: overlaps(n, 2.0 / n_across, n_fine, 2.0 / n_fine).toarray())
         path_um = self._aperture.path_um(at[np.newaxis, :], at[:, np.newaxis], wave_nm, field_um)
-        phase = torch.from_numpy(np.exp(2j * np.pi / float(um_from_nm(wave_nm)) * path_um))
+        phase = get(f"phase of pupil {key}", compute=lambda: np.exp(2j * np.pi / float(um_from_nm(wave_nm)) * path_um))
         transmittance = (fine * fine).sum() / disc.sum()
         return (mean @ fine @ mean.T) * phase, transmittance / self._aperture.transmittance(wave_nm)
 
@@ -371,10 +481,11 @@ class Imaging(nn.Module):
         for name in self.wrt:
             if name == "pupil":
                 continue
+            get, variable = partial(self._constants.get, like=getattr(self, name)), getattr(self, name)
             # The number of samples differs between wavelengths.
-            modes = self._once(name, at.size, field_um, partial(self._modes, name, x, y, field_um))
-            start = self._once(f"start of {name}", 0, (0.0, 0.0), partial(self._start, name))
-            change = torch.tensordot((getattr(self, name) - constant(start)).reshape(-1), constant(modes), dims=1)
+            modes = get(f"{name} {at.size} {field_um}", compute=partial(self._modes, name, x, y, field_um))
+            start = get(f"start of {name}", compute=partial(self._start, name))
+            change = torch.tensordot((variable - start).reshape(-1), modes, dims=1)
             total = change if total is None else total + change
         return total
 
@@ -404,14 +515,131 @@ class Imaging(nn.Module):
         k = self._imaging.oversample
         n_source_cells = float(k) if self._imaging.is_square_source else 0.0
         cycles_x, cycles_y = self._cycles(n_y, n_x)
-        total = torch.zeros(tables.shape[0], cycles_y.size, cycles_x.size, dtype=tables.dtype)
+        total = torch.zeros(tables.shape[0], cycles_y.size, cycles_x.size, dtype=tables.dtype, device=tables.device)
+        get = partial(self._constants.get, like=tables)
         for a_y in range(-n_alias, n_alias + 1):
             y, gain_y = _alias(cycles_y, a_y, n_source_cells, is_alternating=k % 2 == 0)
             for a_x in range(-n_alias, n_alias + 1):
                 x, gain_x = _alias(cycles_x, a_x, n_source_cells, is_alternating=k % 2 == 0)
-                gain = torch.from_numpy(gain_y[:, np.newaxis] * gain_x)
+                gain = get(f"gain {a_y} {a_x} {n_y} {n_x}", compute=partial(np.multiply.outer, gain_y, gain_x))
                 total = total + gain * _bilinear(tables, y * per_step / pitch_um, x * per_step / pitch_um)
         return total
+
+
+def _slices(cells: tuple[Any, Any]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Return indices of consecutive cells as slices."""
+    to, source = (tuple(slice(int(axis.min()), int(axis.max()) + 1) for axis in part) for part in cells)
+    return to, source  # type: ignore[return-value]
+
+
+class _Padding:
+    """Padded part of pictures: repeated pixels, times the falloff."""
+
+    def __init__(self, rows: _Runs, columns: _Runs, window: Floats, *, is_before: bool) -> None:
+        self._rows, self._columns, self._is_before = rows, columns, is_before
+        self._is_even = bool(np.all(window == 1.0))
+        self._constants = Constants(window=window)
+
+    @classmethod
+    def of(cls, rows: PatchExtent, columns: PatchExtent, window: Floats) -> _Padding:
+        """Return the padding of a patch with the window over its sources."""
+        before = rows.pixels.start, columns.pixels.start
+        after = rows.cells.size - rows.pixels.stop, columns.cells.size - columns.pixels.stop
+        along_y, along_x = (
+            _Runs(each.sources, n, m) for each, n, m in zip((rows, columns), before, after, strict=True)
+        )
+        # Padding repeats pixels with their factor: then it is that of the pixels, of which there are fewer.
+        shape = int(rows.sources.max()) + 1, int(columns.sources.max()) + 1
+        of_pixels = np.ones(shape)
+        of_pixels[rows.sources[:, np.newaxis], columns.sources] = window
+        is_repeated = np.array_equal(of_pixels[rows.sources][:, columns.sources], window)
+        if is_repeated and along_y.is_complete and along_x.is_complete:
+            return cls(along_y, along_x, of_pixels, is_before=True)
+        return cls(along_y, along_x, window, is_before=False)
+
+    def apply(self, pictures: Tensor) -> Tensor:
+        """Return the padded part of pictures (..., n_y, n_x)."""
+        window = None if self._is_even else self._constants.get("window", pictures)
+        if window is not None and self._is_before:
+            pictures = pictures * window
+        found = self._columns.take(self._rows.take(pictures, -2), -1)
+        if window is not None and not self._is_before:
+            found = found * window
+        before, after = zip(*((runs.n_before, runs.n_after) for runs in (self._columns, self._rows)), strict=True)
+        return nn.functional.pad(found, (before[0], after[0], before[1], after[1])) if any((*before, *after)) else found
+
+
+class _Runs:
+    """Sources of the pixels along an axis, of which the longest run is copied."""
+
+    def __init__(self, sources: Ints, n_before: int, n_after: int) -> None:
+        self.n_before, self.n_after = n_before, n_after
+        starts = np.concatenate(([0], np.flatnonzero(np.diff(sources) != 1) + 1, [sources.size]))
+        longest = int(np.argmax(np.diff(starts)))
+        first, last = int(starts[longest]), int(starts[longest + 1])
+        self._run = slice(int(sources[first]), int(sources[last - 1]) + 1)
+        self._constants = Constants(before=sources[:first], after=sources[last:])
+        self._has_parts = first > 0, last < sources.size
+        self._n_sources = int(sources.max()) + 1
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the run contains all pixels."""
+        return self._run == slice(0, self._n_sources)
+
+    def take(self, values: Tensor, axis: int) -> Tensor:
+        """Return the elements along an axis."""
+        run = values.narrow(axis, self._run.start, self._run.stop - self._run.start)
+        before, after = (
+            [values.index_select(axis, self._constants.get(name, values))] if is_there else []
+            for name, is_there in zip(("before", "after"), self._has_parts, strict=True)
+        )
+        return torch.cat([*before, run, *after], dim=axis) if before or after else run
+
+
+def _products(spectra: Tensor, transfer: Tensor) -> Tensor:
+    """
+    Return sums over images of spectra times transfer functions.
+
+    Of (n_scene, n_image, ...) and (n_output, n_image, ...): (n_scene, n_output, ...).
+    """
+    is_real = not transfer.is_complex()
+    if is_real:  # interleaved, once for real and imaginary parts
+        spectra, shape = torch.view_as_real(spectra).flatten(-2), spectra.shape
+    transfer = transfer.to(device=spectra.device, dtype=spectra.dtype)
+    if spectra.requires_grad or transfer.requires_grad:
+        outputs = []
+        for of_output in transfer:
+            total = spectra[:, 0] * of_output[0]
+            for image in range(1, of_output.shape[0]):
+                total = torch.addcmul(total, spectra[:, image], of_output[image])
+            outputs.append(total)
+        found = torch.stack(outputs, dim=1)
+    else:
+        found = spectra.new_empty(spectra.shape[0], transfer.shape[0], *spectra.shape[2:])
+        for output, of_output in enumerate(transfer):
+            total = torch.mul(spectra[:, 0], of_output[0], out=found[:, output])
+            for image in range(1, of_output.shape[0]):
+                total.addcmul_(spectra[:, image], of_output[image])
+    return torch.view_as_complex(found.unflatten(-1, (shape[-1], 2))) if is_real else found
+
+
+def interleaved(transfer: Tensor) -> Tensor:
+    """
+    Return constant transfer functions without imaginary part as real numbers.
+
+    Twice each, for the real and imaginary parts of spectra.
+    """
+    if transfer.is_complex() and not bool(transfer.imag.any()):
+        return transfer.real.repeat_interleave(2, dim=-1)
+    return transfer
+
+
+def _shifted(cycles: Tensor, shift: Tensor) -> Tensor:
+    """Return the factors (n_scene, n_cycle) of spectra of shifted cells."""
+    angle = 2.0 * math.pi * shift[:, None] * cycles
+    factor = torch.complex(torch.cos(angle), torch.sin(angle))
+    return torch.where(cycles.abs() == 0.5, factor.real.to(factor.dtype), factor)
 
 
 def _alias(cycles: Floats, alias: int, n_source_cells: float, *, is_alternating: bool) -> tuple[Floats, Floats]:
@@ -429,7 +657,8 @@ def _bilinear(tables: Tensor, v: Floats, u: Floats) -> Tensor:
         is_inside = np.abs(at) < half
         low = np.clip(np.floor(at).astype(np.int64) + half, 0, 2 * half - 1)
         weight = np.where(is_inside, at + half - low, 0.0)
-        return torch.from_numpy(low), constant(weight), constant(is_inside)
+        index, *factors = (torch.from_numpy(each).to(tables.device) for each in (low, weight, is_inside))
+        return index, *(each.to(tables.real.dtype) for each in factors)  # type: ignore[return-value]
 
     (j, wv, in_v), (i, wu, in_u) = split(v), split(u)
     rows = tables[:, j] * (1.0 - wv)[:, None] + tables[:, j + 1] * wv[:, None]

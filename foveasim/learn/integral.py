@@ -16,9 +16,10 @@ from torch import Tensor
 
 from foveasim._core.threads import thread_count
 from foveasim._core.validation import Floats, Ints
-from foveasim.errors import GeometryError
+from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import EdgeMoments, Integrator
+from foveasim.learn._edges import integrate_edges
 from foveasim.learn._tensors import as_array, check_tensor
 from foveasim.learn.mesh import Mesh
 from foveasim.learn.outlines import Outlines
@@ -88,8 +89,14 @@ def site_power(
         outlines = outlines.outlines
     points = outlines.check_points(points)
     if not isinstance(maps, Tensor) or maps.ndim < 2:
-        check_tensor("maps", maps, grid.shape, " or (..., n_y, n_x)")
-    flat = check_tensor("maps", maps.reshape(-1, *maps.shape[-2:]), (None, *grid.shape), ", as the grid")
+        check_tensor("maps", maps, grid.shape, " or (..., n_y, n_x)", any_device=True)
+    flat = maps.reshape(-1, *maps.shape[-2:])
+    check_tensor("maps", flat, (None, *grid.shape), ", as the grid", any_device=True)
+    if points.device != maps.device:
+        raise ParameterError("maps", f"must be on the device of the points, {points.device}, got {maps.device}")
+    if points.device.type != "cpu":
+        found = integrate_edges(points, flat, outlines, grid, 2 if order == 2 else 1)
+        return found.reshape(*maps.shape[:-2], outlines.n_sites)
     integral = Integral(outlines, grid, 2 if order == 2 else 1, thread_count(n_threads))
     return _Power.apply(points, flat, integral, False).reshape(*maps.shape[:-2], outlines.n_sites)  # type: ignore[no-any-return, no-untyped-call]
 

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor, nn
 
+from foveasim._io.mapped_files import in_memory
 from foveasim.camera import Camera
 from foveasim.camera._footprints import placed
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
-from foveasim.integrate import UndistortedOutlines
-from foveasim.learn._tensors import constant
+from foveasim.integrate import Integrator, UndistortedOutlines
+from foveasim.learn._tensors import Constants, SparseMap, check_tensor, constant
 from foveasim.learn.distortion import coefficient_names, coefficient_values, undistort, with_coefficients
 from foveasim.learn.imaging import VARIABLES as LENS_VARIABLES
-from foveasim.learn.imaging import Imaging, _check_variables
+from foveasim.learn.imaging import Imaging, _check_variables, interleaved
 from foveasim.learn.integral import site_power
 from foveasim.learn.mesh import Mesh
+from foveasim.learn.outlines import Outlines
 from foveasim.learn.readout import Readout
 from foveasim.scene import Scene
 from foveasim.sensor import ConstantCurve, FilterSet, TableCurve
@@ -99,12 +103,12 @@ class Model(nn.Module):
         super().__init__()
         self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
         self._camera, self._scene = camera, camera.seen(scene)
+        self._boundary: Literal["fixed", "sliding", "free"] = boundary
         sensor = camera.sensor
         self.imaging: Imaging = Imaging(
             camera.optics, self._scene, [name for name in self.wrt if name in LENS_VARIABLES]
         )
         self.grid: Grid = camera.sensor_frame(self._scene).image(self.imaging.grid)
-        self.register_buffer("_position_um", constant(camera.position_um))
         self.order = camera.order(self._scene)
         self._footprints = camera.footprints(scene)
         if self._footprints is not None and "vertices" in self.wrt:
@@ -113,11 +117,14 @@ class Model(nn.Module):
                 "must not contain 'vertices' for a sensor with pixel optics, whose response and outlines are constants; remove "
                 "'pixel_optics' from the sensor",
             )
-        layout: Any = placed(camera.layout, self._footprints, (0.0, 0.0))
-        self.mesh = Mesh(layout, boundary).requires_grad_("vertices" in self.wrt)
-        self.readout: Readout = Readout(sensor)
+        depends = sensor.collection.needs_exposure
+        if depends and "exposure_s" in self.wrt:
+            raise ParameterError(
+                "wrt",
+                f"must not contain 'exposure_s': the collection '{sensor.collection.name}' of the sensor depends on it",
+            )
+        self.readout: Readout = Readout(sensor, float(exposure_s) if depends else None)
         wave_nm = self._scene.wavelength_nm
-        self.register_buffer("_photons_per_j", constant(1.0 / photon_energy_j(wave_nm)))
         product = sensor.responsivity_e_per_j(wave_nm) * photon_energy_j(wave_nm)
         filters = sensor.filter_transmission(wave_nm)
         qe = np.divide(product, filters, out=np.zeros_like(product), where=filters > 0.0)
@@ -136,40 +143,77 @@ class Model(nn.Module):
                 setattr(self, name, nn.Parameter(constant(value)))
             else:
                 self.register_buffer(name, constant(value))
-        self._parts = [
-            (int(c), torch.from_numpy(np.flatnonzero(sensor.filter_of_site == c))) for c in sensor.filters_used
-        ]
-        self._outlines = self.mesh.outlines
-        self._subdivision: Any = None
-        if camera.distortion is not None:
-            self._outlines, self._subdivision = self._outlines.subdivide(self._count_pieces())
-        self._outlines_of = [self._outlines.select(sites.numpy()) for _, sites in self._parts]
+        self._used = sensor.filters_used.tolist()
+        self._constants = Constants(
+            photons_per_j=1.0 / photon_energy_j(wave_nm),
+            **{f"sites {c}": np.flatnonzero(sensor.filter_of_site == c) for c in self._used},
+        )  # fmt: skip
+        if self._footprints is not None:
+            self._constants.add(factor=self._footprints.factor, area_ratio=self._footprints.area_ratio)
+        mixing = None if self._footprints is None else self._footprints.mixing
+        self._mixing = None if mixing is None else SparseMap(mixing)
+        self._moving: _MovingSites | None = None
+        self._matrices: list[SparseMap] = []
+        if {"vertices", "distortion"} & set(self.wrt):
+            self._moving = _MovingSites(self.mesh, camera, self.grid)
+        else:
+            weights = self._integrator().weights()
+            if not self.imaging.has_patches:
+                weights = _on_columns(weights, self.grid.shape[1], *self.imaging.padded_columns)
+            self._matrices = [SparseMap(weights[np.flatnonzero(sensor.filter_of_site == c)]) for c in self._used]
+        self._has_fixed_light = not {*LENS_VARIABLES, "filters", "qe"} & set(self.wrt)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "mesh" and "mesh" not in self._modules:  # built on its first use
+            layout: Any = placed(self._camera.layout, self._footprints, (0.0, 0.0))
+            self.mesh = Mesh(layout, self._boundary).requires_grad_("vertices" in self.wrt)
+            return self.mesh
+        return super().__getattr__(name)
 
     def __repr__(self) -> str:
         return f"Model({self._camera!r}, variables: {', '.join(self.wrt)})"
 
-    def _count_pieces(self) -> Any:
-        """Return the number of chords of each edge that the distortion requires."""
-        edges = self._outlines.edges
-        layout = self.mesh.layout().translate(*self._camera.position_um)
-        lens = self._camera.distortion
-        assert lens is not None
-        pieces = UndistortedOutlines(layout, lens, min(self.grid.pitch_x_um, self.grid.pitch_y_um)).count_pieces()
-        n_pieces = np.ones(edges.n_edges, np.int64)
-        np.maximum.at(n_pieces, edges.edge, pieces)
-        return n_pieces
+    @property
+    def n_sites(self) -> int:
+        """Number of photosites."""
+        return self._camera.layout.n_sites
+
+    def _integrator(self) -> Integrator:
+        """Return the layout compiled for the grid of the maps."""
+        return self._camera.integrator(self.grid, order=self.order, footprints=self._footprints)
 
     def points(self) -> Tensor:
         """Return the points of the outlines in the plane of the maps, (n_point, 2) tensor, µm."""
-        points = self.mesh()
-        if any(self._camera.position_um):
-            points = points + self._position_um
-        lens = self._camera.distortion
-        if lens is None:
-            return points
-        return undistort(lens, self._subdivision(points), self.distortion, self.distortion_names)
+        if self._moving is None:
+            self._moving = _MovingSites(self.mesh, self._camera, self.grid)
+        return self._moving.points(self.mesh(), self.distortion, self.distortion_names)
 
-    def photo_e_per_s(self, basis: Tensor | None = None) -> Tensor:
+    def transfer(self) -> list[Tensor]:
+        """
+        Compute the transfer functions from basis images to maps of photoelectrons.
+
+        Returns
+        -------
+        list of (n_filter, n_image, n_row, n_column) complex tensors
+            Of :meth:`Imaging.transfer`, for the filters that sites have; constants unless filters or optics are variables.
+        """
+        if not self._has_fixed_light:
+            return self._transfer()
+        with torch.no_grad():
+            like: Tensor = self.exposure_s
+            found: list[Tensor] = []
+            while f"transfer {len(found)}" in self._constants:
+                found.append(self._constants.get(f"transfer {len(found)}", like))
+            if not found:
+                found = [interleaved(each) for each in self._transfer()]
+                self._constants.add(**{f"transfer {k}": each.cpu().numpy() for k, each in enumerate(found)})
+        return found
+
+    def _transfer(self) -> list[Tensor]:
+        e_per_j = self.filters[self._used] * self.qe[self._used]
+        return self.imaging.transfer(e_per_j * self._constants.get("photons_per_j", e_per_j))
+
+    def photo_e_per_s(self, basis: Tensor | None = None, gaze_um: Tensor | None = None) -> Tensor:
         """
         Compute the expected photoelectrons of each site per second.
 
@@ -177,48 +221,102 @@ class Model(nn.Module):
         ----------
         basis : (..., n_basis, n_y, n_x) tensor, optional
             Basis images of scenes; by default those of the scene.
+        gaze_um : (n_scene, 2) tensor, optional, µm
+            Gaze for each scene, in addition to that of the camera: see :class:`SensorLayer`.
 
         Returns
         -------
-        (..., n_site) float64 tensor, e-/s
+        (..., n_site) tensor, e-/s
+            On the device and with the dtype of the basis images; float64 for those of the scene.
         """
-        used = [c for c, _ in self._parts]
-        e_per_j = self.filters[used] * self.qe[used] * self._photons_per_j
-        maps = self.imaging(e_per_j, basis)
-        points = self.points()
-        rates = torch.zeros(*maps.shape[:-3], self.mesh.n_sites, dtype=torch.float64)
-        for k, (_, sites) in enumerate(self._parts):
-            power = site_power(points, maps[..., k, :, :], self._outlines_of[k], self.grid, order=self.order)
-            rates = rates.index_add(-1, sites, power)
-        return self._collect(rates * float(w_from_w_m2_um2(1.0)))
+        if basis is None:
+            basis = torch.from_numpy(np.array(in_memory(self._scene.basis), np.float64)).to(self.exposure_s.device)
+        if not isinstance(basis, Tensor) or basis.ndim < 3:
+            check_tensor("basis", basis, self._scene.basis.shape, any_device=True)
+        shift = None if gaze_um is None else self._shift(basis, gaze_um)
+        transfer, flat = self.transfer(), basis.reshape(-1, *basis.shape[-3:])
+        check_tensor("basis", flat, (None, *self._scene.basis.shape), ", as the scene", any_device=True)
+        image = self.imaging.padded if self._matrices and not self.imaging.has_patches else self.imaging.filtered
+        rates = [
+            self._integrated(image(flat[part], transfer, None if shift is None else shift[part]))
+            for part in self.parts(flat.shape[0], flat.device)
+        ]
+        found = rates[0] if len(rates) == 1 else torch.cat(rates)
+        return self._collect(found.reshape(*basis.shape[:-3], self.n_sites) * float(w_from_w_m2_um2(1.0)))
+
+    def parts(self, n_scenes: int, device: torch.device) -> list[slice]:
+        """Return the parts of a batch that are computed at once."""
+        # Sites that move are compiled for all maps of the batch.
+        return self.imaging.split(n_scenes, device) if self._matrices else [slice(None)]
+
+    def _integrated(self, maps: Tensor) -> Tensor:
+        """Return the integrals (n_scene, n_site) of maps over the sites of each filter."""
+        points = None if self._moving is None or self._matrices else self.points()
+        rates = maps.new_zeros(maps.shape[0], self.n_sites) if len(self._used) > 1 else maps
+        for k, c in enumerate(self._used):
+            if points is None:
+                power = self._matrices[k].apply(maps[:, k].flatten(-2))
+            else:
+                assert self._moving is not None
+                power = site_power(points, maps[:, k], self._moving.outlines_of[k], self.grid, order=self.order)
+            if len(self._used) == 1:
+                return power
+            rates = rates.index_copy(-1, self._constants.get(f"sites {c}", power), power)
+        return rates
+
+    def _shift(self, basis: Tensor, gaze_um: Tensor) -> Tensor:
+        """Return gazes in cells of the maps, (n_scene, 2)."""
+        n_scenes = math.prod(basis.shape[:-3])
+        check_tensor("gaze_um", gaze_um, (n_scenes, 2), ", one row (x, y) per picture", any_device=True)
+        camera = self._camera
+        if camera.axis == "image" and camera.distortion is not None:
+            raise ParameterError(
+                "gaze_um",
+                "must be that of the camera for a lens model, whose distortion stays with the image; use Camera(axis='sensor')",
+            )
+        if camera.axis == "sensor" and not self.imaging.is_invariant:
+            raise ParameterError(
+                "gaze_um",
+                "must be that of the camera for axis='sensor', unless irradiance and PSF are equal everywhere; use "
+                "axis='image', or an even Optics(relative_illumination=...)",
+            )
+        if self.imaging.has_patches:
+            raise ParameterError(
+                "gaze_um", "must be that of the camera with isoplanatic patches: set field_patches=None"
+            )
+        if self._footprints is not None:
+            raise ParameterError("gaze_um", "must be that of the camera with pixel optics: create one layer per gaze")
+        return gaze_um.to(basis) / self.grid_pitch_um(basis)
+
+    def grid_pitch_um(self, like: Tensor) -> Tensor:
+        """Return the pitch of the maps along x and y, (2,) µm, as a tensor like another one."""
+        return self._constants.get("pitch_um", like, lambda: self.grid.pitch_xy_um)
 
     def _collect(self, rates: Tensor) -> Tensor:
         """Return the rates that the sites collect through pixel optics, (..., n_site)."""
         if self._footprints is None:
             return rates
-        collected = rates * constant(self._footprints.factor)
-        if self._footprints.mixing is None:
+        collected = rates * self._constants.get("factor", rates)
+        if self._mixing is None:
             return collected
-        mixing = self._footprints.mixing.tocoo()
-        rows, columns = (torch.from_numpy(each.astype(np.int64)) for each in (mixing.row, mixing.col))
-        incident = rates / constant(self._footprints.area_ratio)
-        return collected.index_add(-1, rows, incident[..., columns] * constant(mixing.data))
+        return collected + self._mixing.apply(rates / self._constants.get("area_ratio", rates))
 
-    def forward(self, basis: Tensor | None = None) -> Tensor:
+    def forward(self, basis: Tensor | None = None, gaze_um: Tensor | None = None) -> Tensor:
         """
         Compute the expected charge of each site.
 
         Parameters
         ----------
-        basis : (..., n_basis, n_y, n_x) tensor, optional
+        basis, gaze_um : optional
             As for :meth:`photo_e_per_s`.
 
         Returns
         -------
-        (..., n_site) float64 tensor, e-
+        (..., n_site) tensor, e-
             ``model.readout`` draws charges and computes codes from them.
         """
-        return self.readout.expected_e(self.photo_e_per_s(basis), self.exposure_s)
+        rates = self.photo_e_per_s(basis, gaze_um)
+        return self.readout.expected_e(rates, self.exposure_s.to(rates.dtype))
 
     def camera(self) -> Camera:
         """
@@ -239,7 +337,7 @@ class Model(nn.Module):
             changes["layout"] = self.mesh.layout()
         if "filters" in self.wrt or "qe" in self.wrt:
             wave_nm = self._scene.wavelength_nm
-            curves = (self.filters * self.qe).detach().numpy()
+            curves = (self.filters * self.qe).detach().double().cpu().numpy()
             if not (np.isfinite(curves).all() and curves.min() >= 0.0 and curves.max() <= 1.0):
                 raise ParameterError(
                     "filters",
@@ -250,7 +348,7 @@ class Model(nn.Module):
             changes["filters"] = FilterSet([_curve(wave_nm, row) for row in curves], sensor.filter_names)
             changes["qe"] = 1.0
         if lens is not None:
-            lens = with_coefficients(lens, self.distortion_names, self.distortion.detach().numpy())
+            lens = with_coefficients(lens, self.distortion_names, self.distortion.detach().double().cpu().numpy())
         return Camera(
             optics=self.imaging.optics(),
             sensor=replace(sensor, **changes),
@@ -259,6 +357,41 @@ class Model(nn.Module):
             gaze_um=self._camera.gaze_um,
             axis=self._camera.axis,
         )
+
+
+def _on_columns(weights: Any, n_x: int, n_columns: int, first: int) -> Any:
+    """Return a matrix for the cells of maps with further columns."""
+    found = weights.tocoo()
+    row, column = np.divmod(np.asarray(found.col, np.int64), n_x)
+    shape = found.shape[0], found.shape[1] // n_x * n_columns
+    return csr_array((found.data, (found.row, row * n_columns + first + column)), shape=shape)
+
+
+class _MovingSites:
+    """Sites whose outlines are variables."""
+
+    def __init__(self, mesh: Mesh, camera: Camera, grid: Grid) -> None:
+        self._lens, self._subdivision = camera.distortion, None
+        self._constants = Constants(position_um=camera.position_um)
+        self._is_moved = any(camera.position_um)
+        outlines: Outlines = mesh.outlines
+        if self._lens is not None:
+            # The number of chords of each edge that the distortion requires.
+            edges, layout = outlines.edges, mesh.layout().translate(*camera.position_um)
+            pieces = UndistortedOutlines(layout, self._lens, min(grid.pitch_x_um, grid.pitch_y_um)).count_pieces()
+            n_pieces = np.ones(edges.n_edges, np.int64)
+            np.maximum.at(n_pieces, edges.edge, pieces)
+            outlines, self._subdivision = outlines.subdivide(n_pieces)
+        sensor = camera.sensor
+        self.outlines_of = [outlines.select(np.flatnonzero(sensor.filter_of_site == c)) for c in sensor.filters_used]
+
+    def points(self, points: Tensor, coefficients: Tensor, names: tuple[str, ...]) -> Tensor:
+        """Return the points of the outlines in the plane of the maps, given those of the mesh."""
+        if self._is_moved:
+            points = points + self._constants.get("position_um", points)
+        if self._lens is None or self._subdivision is None:
+            return points
+        return undistort(self._lens, self._subdivision(points), coefficients, names)
 
 
 def _curve(wavelength_nm: Any, values: Any) -> Any:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import shapely
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -19,7 +18,7 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.integrate import SharedEdges
 from foveasim.layout import Layout, node
 from foveasim.layout._noding import merge_coincident_points
-from foveasim.learn._tensors import as_array, check_tensor
+from foveasim.learn._tensors import Constants, as_array, check_tensor
 
 __all__ = ["Outlines"]
 
@@ -99,21 +98,19 @@ class Outlines:
         return SharedEdges(self.ring_offsets, self.site_offsets, self.vertex)
 
     @cached_property
-    def _vertex(self) -> Tensor:
-        return torch.from_numpy(np.array(self.vertex))
-
-    @cached_property
-    def _after(self) -> Tensor:
-        return torch.from_numpy(np.array(self.edges.after))
-
-    @cached_property
-    def _site(self) -> Tensor:
-        return torch.from_numpy(np.array(self.edges.site))
+    def constants(self) -> Constants:
+        """Indices of vertices and edges, as tensors of any device."""
+        edges = self.edges
+        begin, end = self.vertex[edges.begin], self.vertex[edges.end]
+        return Constants(
+            vertex=self.vertex, after=edges.after, site=edges.site, edge=edges.edge,
+            edge_begin=begin, edge_end=end, edge_sign=np.where(edges.is_reversed, -1.0, 1.0),
+        )  # fmt: skip
 
     def vertices(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the positions of all vertices, and of the next one in each ring."""
-        begin = points[self._vertex]
-        return begin, begin[self._after]
+        begin = points[self.constants.get("vertex", points)]
+        return begin, begin[self.constants.get("after", points)]
 
     def area_um2(self, points: Tensor) -> Tensor:
         """
@@ -131,11 +128,11 @@ class Outlines:
         points = self.check_points(points)
         begin, end = self.vertices(points)
         twice = begin[:, 0] * end[:, 1] - begin[:, 1] * end[:, 0]
-        return torch.zeros(self.n_sites, dtype=points.dtype).index_add(0, self._site, 0.5 * twice)
+        return points.new_zeros(self.n_sites).index_add(0, self.constants.get("site", points), 0.5 * twice)
 
     def check_points(self, points: object) -> Tensor:
         """Return positions, (n_point, 2), if they are a valid tensor."""
-        return check_tensor("points", points, (self.n_points, 2), ", one row per point")
+        return check_tensor("points", points, (self.n_points, 2), ", one row per point", any_device=True)
 
     def layout(self, points: Tensor, step: str = "moved vertices") -> Layout:
         """
@@ -221,9 +218,9 @@ class Outlines:
         k = positions_in_runs(n_inner) + 1
         identity = np.arange(self.n_points)
         subdivision = Subdivision(
-            torch.from_numpy(np.concatenate((identity, begin[edge]))),
-            torch.from_numpy(np.concatenate((identity, end[edge]))),
-            torch.from_numpy(np.concatenate((np.zeros(self.n_points), k / n_pieces[edge]))),
+            np.concatenate((identity, begin[edge])),
+            np.concatenate((identity, end[edge])),
+            np.concatenate((np.zeros(self.n_points), k / n_pieces[edge])),
         )
         # Every vertex is followed by the inner points of its edge, in the direction of its ring.
         first_inner = self.n_points + np.cumsum(n_inner) - n_inner
@@ -240,11 +237,16 @@ class Outlines:
 class Subdivision:
     """Positions of the points of subdivided edges, as linear functions of their end points."""
 
-    begin: Tensor
-    end: Tensor
-    fraction: Tensor
+    begin: Ints
+    end: Ints
+    fraction: Floats
+
+    @cached_property
+    def _constants(self) -> Constants:
+        return Constants(begin=self.begin, end=self.end, fraction=self.fraction)
 
     def __call__(self, points: Tensor) -> Tensor:
         """Return the positions (n, 2) for positions of the end points."""
-        t = self.fraction.to(points.dtype)[:, None]
-        return (1.0 - t) * points[self.begin] + t * points[self.end]
+        begin, end = (points[self._constants.get(name, points)] for name in ("begin", "end"))
+        t = self._constants.get("fraction", points)[:, None]
+        return (1.0 - t) * begin + t * end

@@ -256,6 +256,14 @@ def _dnl_normal(key, line, code, quantiles):
     return _interpolate(quantiles, k, position - k)
 
 
+@njit(types.void(_adc, _lines, types.float64[:, ::1]))
+def dnl_offsets(adc, line, offset_dn):
+    """Write the DNL offset of each readout line and code, (n_line, n_code)."""
+    for i in range(line.size):
+        for code in range(adc.n_codes):
+            offset_dn[i, code] = adc.dnl_dn * _dnl_normal(adc.dnl_key, line[i], code, adc.quantiles)
+
+
 @njit()
 def _quantise(value, n_codes):
     """Quantise to a code in float64."""

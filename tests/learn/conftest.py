@@ -1,10 +1,24 @@
-"""One thread of PyTorch per process: several processes with several threads each would wait for each other."""
+"""
+One thread of PyTorch per process: several processes with several threads each would wait for each other.
+
+Tests with the fixture ``device`` run on all devices that the machine has, and on ``meta``, whose tensors have no values.
+"""
 
 from __future__ import annotations
 
 from importlib.util import find_spec
 
+import pytest
+
+DEVICES = ["cpu", "meta"]
 if find_spec("torch"):
     import torch
 
     torch.set_num_threads(1)
+    if torch.cuda.is_available():
+        DEVICES.append("cuda")
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    return torch.device(request.param)

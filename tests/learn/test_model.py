@@ -327,7 +327,7 @@ def test_drawn_charges_have_stated_moments():
 
 
 def test_drawn_charges_stop_at_full_well():
-    readout = learn.Readout(sensor(full_well_e=1000.0))
+    readout = learn.Readout(sensor(full_well_e=1000.0, read_noise_e=0.0))
     charge = torch.full((readout.sensor.layout.n_sites,), 5000.0, dtype=torch.float64, requires_grad=True)
     drawn = readout.draw(charge)
     drawn.sum().backward()

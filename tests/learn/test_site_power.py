@@ -119,10 +119,10 @@ MESH = learn.Mesh(hexagons())
         (np.zeros((3, 2)), None, "'points' must be a Tensor, got an ndarray"),
         (torch.zeros(3, 2), None, r"'points' must have the shape \(38, 2\), one row per point, got \(3, 2\)"),
         (torch.zeros(38, 2, dtype=torch.int64), None, "floating-point numbers, got torch.int64; use .double"),
-        (torch.zeros(38, 2, device="meta"), None, "must be on the CPU, got a tensor on meta; use .cpu"),
+        (torch.zeros(38, 2, device="meta"), None, "'maps' must be on the device of the points, meta, got cpu"),
         (None, torch.ones(3, 3), "'maps' must have the shape"),
         (None, torch.ones(12, 14, dtype=torch.int32), "'maps' must be a tensor of floating-point numbers"),
-        (None, torch.ones(12, 14, device="meta"), "'maps' must be on the CPU"),
+        (None, torch.ones(12, 14, device="meta"), "'maps' must be on the device of the points, cpu, got meta"),
         (None, np.ones((12, 14)), "'maps' must be a Tensor"),
     ],
 )

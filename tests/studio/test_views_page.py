@@ -284,8 +284,8 @@ def test_drag_shows_previews_and_then_everything(visit, monkeypatch):
     monkeypatch.setattr(_engine, "PREVIEW_CELLS", 1 << 14)
     page = visit()
     page.evaluate("() => { studio.connection.set('optics.f_number', 4, false); }")
-    until(page, "() => /^preview, /.test(document.getElementById('status').textContent.trim())")
-    assert page.evaluate("studio.views.parts.columns.is_preview && studio.state.is_preview")
+    status = "/^preview, /.test(document.getElementById('status').textContent.trim())"
+    until(page, f"() => {status} && studio.views.parts.columns?.is_preview && studio.state.is_preview")
     # Without further changes the complete result follows.
     until(page, "() => studio.isReady && !studio.connection.requests.isPreview && !studio.state.is_preview")
     assert "preview" not in page.inner_text("#status")
