@@ -51,6 +51,7 @@ from foveasim.layout.generators.sunflower import sunflower
 from foveasim.layout.generators.tiling import fill, tiling
 from foveasim.layout.generators.voronoi import voronoi
 from foveasim.layout.generators.zones import zones
+from foveasim.layout.graph import SiteGraph, to_graph
 from foveasim.layout.model import Layout
 from foveasim.layout.optical_formats import OPTICAL_FORMATS, OpticalFormat
 from foveasim.layout.readout import nearest_bus, readout_by, readout_order
@@ -78,6 +79,7 @@ __all__ = [
     "Routing",
     "Rule",
     "RuleResult",
+    "SiteGraph",
     "SolveFor",
     "Summary",
     "Violation",
@@ -131,6 +133,7 @@ __all__ = [
     "square_ring_ratio",
     "sunflower",
     "tiling",
+    "to_graph",
     "track_demand",
     "union",
     "voronoi",

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from foveasim.layout.drc.routing import Readout
     from foveasim.layout.drc.rules import DesignRules, Report
     from foveasim.layout.files import WrittenLayout
+    from foveasim.layout.graph import SiteGraph
     from foveasim.layout.summary import Summary
 
 __all__ = ["Layout"]
@@ -579,6 +580,12 @@ class Layout:
         from foveasim.layout.adjacency import adjacency
 
         return adjacency(self) if max_gap_um is None else adjacency(self, max_gap_um=max_gap_um)
+
+    def to_graph(self, *, n_neighbours: int | None = None, **options: Any) -> SiteGraph:
+        """Return the graph of the sites; see :func:`foveasim.layout.to_graph`."""
+        from foveasim.layout.graph import to_graph
+
+        return to_graph(self, n_neighbours=n_neighbours, **options)
 
     # -- design rules --------------------------------------------------------------------------------------------------
 

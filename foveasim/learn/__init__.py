@@ -1,7 +1,8 @@
 """
 Gradients with respect to photosites, optics and electronics, for PyTorch.
 
-The functions take and return tensors on the CPU; the kernels below them are those of the simulator. Requires the extra
+Cameras are layers of networks on any device; layouts with variable vertices use the kernels of the simulator on the CPU, and
+operations of PyTorch elsewhere. Requires the extra
 ``learn``: without PyTorch the module has no names, and their use raises an ImportError.
 """
 
@@ -14,6 +15,7 @@ from foveasim._core.calls import publish
 from foveasim._core.extras import needs
 
 __all__ = [
+    "Cortical",
     "Imaging",
     "Mesh",
     "Model",
@@ -21,6 +23,8 @@ __all__ = [
     "PowerCells",
     "Readout",
     "SensorLayer",
+    "SiteConv",
+    "SitePool",
     "barrier",
     "capture",
     "generated",
@@ -40,6 +44,9 @@ if TYPE_CHECKING or find_spec("torch") is not None:
     from foveasim.learn.penalties import barrier
     from foveasim.learn.power_cells import PowerCells
     from foveasim.learn.readout import Readout
+    from foveasim.learn.sites.convolution import SiteConv
+    from foveasim.learn.sites.cortical import Cortical
+    from foveasim.learn.sites.pooling import SitePool
 
     publish(__name__)
 else:

@@ -38,6 +38,8 @@ VARIABLES = ("zernike", "seidel", "defocus", "pupil")
 PATCHES = 5
 #: Number of cells, of all padded basis images, that a processor transforms at once: they stay in its cache.
 MAX_PART = 2**21
+#: Largest number of runs of pixels that padding copies; others are looked up.
+MAX_RUNS = 8
 #: Coefficients of Seidel aberrations, in the order of the tensor.
 SEIDEL_NAMES = ("spherical_um", "coma_um", "astigmatism_um", "field_curvature_um")
 #: Largest number of aliases per side of a lens with variables; more would take minutes.
@@ -570,31 +572,37 @@ class _Padding:
 
 
 class _Runs:
-    """Sources of the pixels along an axis, of which the longest run is copied."""
+    """Sources of the pixels along an axis, as runs with steps of 1, -1 or 0."""
 
     def __init__(self, sources: Ints, n_before: int, n_after: int) -> None:
         self.n_before, self.n_after = n_before, n_after
-        starts = np.concatenate(([0], np.flatnonzero(np.diff(sources) != 1) + 1, [sources.size]))
-        longest = int(np.argmax(np.diff(starts)))
-        first, last = int(starts[longest]), int(starts[longest + 1])
-        self._run = slice(int(sources[first]), int(sources[last - 1]) + 1)
-        self._constants = Constants(before=sources[:first], after=sources[last:])
-        self._has_parts = first > 0, last < sources.size
-        self._n_sources = int(sources.max()) + 1
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the run contains all pixels."""
-        return self._run == slice(0, self._n_sources)
+        self._runs: list[tuple[int, int, int]] = []
+        k = 0
+        while k < sources.size and len(self._runs) <= MAX_RUNS:
+            step = int(sources[k + 1] - sources[k]) if k + 1 < sources.size else 1
+            step = step if abs(step) <= 1 else 1
+            n = 1
+            while k + n < sources.size and sources[k + n] - sources[k + n - 1] == step:
+                n += 1
+            self._runs.append((int(sources[k]), n, step))
+            k += n
+        self._constants = Constants(sources=sources)
+        self.is_complete = any(run == (0, int(sources.max()) + 1, 1) for run in self._runs)
 
     def take(self, values: Tensor, axis: int) -> Tensor:
         """Return the elements along an axis."""
-        run = values.narrow(axis, self._run.start, self._run.stop - self._run.start)
-        before, after = (
-            [values.index_select(axis, self._constants.get(name, values))] if is_there else []
-            for name, is_there in zip(("before", "after"), self._has_parts, strict=True)
-        )
-        return torch.cat([*before, run, *after], dim=axis) if before or after else run
+        if len(self._runs) > MAX_RUNS:
+            return values.index_select(axis, self._constants.get("sources", values))
+        parts = []
+        for first, n, step in self._runs:
+            if step == 0:
+                shape = list(values.shape)
+                shape[axis] = n
+                parts.append(values.narrow(axis, first, 1).expand(shape))
+            else:
+                run = values.narrow(axis, first if step > 0 else first - n + 1, n)
+                parts.append(run if step > 0 else run.flip(axis))
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=axis)
 
 
 def _products(spectra: Tensor, transfer: Tensor) -> Tensor:

@@ -244,6 +244,18 @@ class Model(nn.Module):
         found = rates[0] if len(rates) == 1 else torch.cat(rates)
         return self._collect(found.reshape(*basis.shape[:-3], self.n_sites) * float(w_from_w_m2_um2(1.0)))
 
+    def overlaps(self, like: Tensor) -> list[Tensor]:
+        """
+        Return the overlaps of sites that do not move with the cells of maps.
+
+        Returns
+        -------
+        list of (n, n_cell) sparse CSR tensors, µm²
+            For the sites of each filter, on the device and with the dtype of another tensor; cells in the columns of
+            :meth:`Imaging.padded`, or of the maps for isoplanatic patches.
+        """
+        return [matrix.tensor(like) for matrix in self._matrices]
+
     def parts(self, n_scenes: int, device: torch.device) -> list[slice]:
         """Return the parts of a batch that are computed at once."""
         # Sites that move are compiled for all maps of the batch.

@@ -520,6 +520,7 @@ CALLS = {
     "layout.sunflower": lambda o: layout.sunflower(50, 2.0),
     "layout.tiling": lambda o: layout.tiling(2.0, size_um=(10.0, 10.0)),
     "layout.track_demand": lambda o: layout.track_demand(o.plain, layout.Routing(width_um=0.1, space_um=0.1)),
+    "layout.to_graph": lambda o: layout.to_graph(o.layout),
     "layout.union": lambda o: layout.union([o.plain, o.plain.translate(50.0, 0.0)]),
     "layout.voronoi": lambda o: layout.voronoi(30, size_um=(20.0, 20.0), seed=0),
     "layout.write_layout": lambda o: layout.write_layout(o.layout, o.path(".npz")),

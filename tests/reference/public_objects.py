@@ -93,7 +93,7 @@ def public_objects(directory):
         CAMERA, capture, fs.DesignRules(preset="sky130_met1"), fs.rgb_filters() * CURVE, fs.Grid((2, 3), 0.5), SITES, OPTICS,
         fs.GaussianCurve(centre_nm=550.0, fwhm_nm=90.0), CAMERA.integrator(GRID), capture.picture(), CAMERA.power_map(SCENE),
         fs.PolynomialCurve(wavelength_nm=TABLE, value=CURVE.value), SCENE, SENSOR, fs.SiliconQE(depth_um=3.0),
-        layout.Change("min_size_um", "dropped", tuple(range(1000))), layout.FORMATS["npz"], layout.LayoutLayer(len), layout.OPTICAL_FORMATS["1/3"], layout.PRESETS["sky130_met1"], sensor.PRESETS["mobile"],
+        layout.Change("min_size_um", "dropped", tuple(range(1000))), layout.FORMATS["npz"], layout.LayoutLayer(len), layout.OPTICAL_FORMATS["1/3"], SITES.to_graph(), layout.PRESETS["sky130_met1"], sensor.PRESETS["mobile"],
         layout.Readout(frames_per_s=30.0, bits=8), REPORT, layout.Routing(width_um=1.0, space_um=1.0), layout.RULES["min_width_um"],
         REPORT.results[0], SITES.describe(layout.Readout(frames_per_s=30.0, bits=8)), REPORT.violations[0],
         SITES.write(directory / "sites.geojson"), BarElement(group=0, element=1, direction="vertical", line_pairs_per_mm=1.0, x_mm=0.0, y_mm=0.0, side_mm=1.0),
