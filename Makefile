@@ -123,5 +123,6 @@ $(LOWEST)/.installed: $(LOWEST)/uv/.made pyproject.toml
 
 $(TORCH_VENV)/.installed: $(TORCH_VENV)/.made pyproject.toml
 	@echo "installing foveasim and PyTorch into $(TORCH_VENV) (minutes with CUDA)"
-	$(TORCH_VENV)/bin/python $(INSTALL) --editable '.[explore,layout,learn]' hypothesis ipykernel nbclient pytest pytest-timeout pytest-xdist
+	$(TORCH_VENV)/bin/python $(INSTALL) --editable '.[adapters,explore,layout,learn]' hypothesis ipykernel nbclient onnxruntime onnxscript pytest \
+		pytest-timeout pytest-xdist
 	touch $@

@@ -42,8 +42,8 @@ def bench_layer(report: Report, n_pictures: int, n_pixels: int, device: torch.de
     pictures = torch.rand(n_pictures, 3, n_pixels, n_pixels, device=device)
     imaging = layer.model.imaging
     width, _ = imaging.padded_columns
-    parts = imaging.split(n_pictures, device)
-    n = parts[0].stop
+    parts = imaging.split(pictures)
+    n = parts[0].stop or n_pictures
     padded, spectra = torch.rand(n, 3, width, width, device=device), None
     spectra = torch.fft.rfft2(padded)
     cells = torch.rand(n_pixels * width, 3 * n_pictures, device=device)

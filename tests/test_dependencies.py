@@ -27,7 +27,7 @@ EXTRAS = {
     "compare": {"maps"},
     "explore": {"explore", "learn"},
     "layout": {"klayout", "layout", "parquet"},
-    "learn": {"learn"},
+    "learn": {"adapters", "learn"},
     "maps": {"maps"},
     "modes": {"video"},
     "optics": {"maps"},

@@ -12,6 +12,7 @@ from foveasim.errors import FileError, ParameterError
 EXTRA_OF = {
     module: extra
     for extra, modules in {
+        "adapters": ("deepinv", "torchvision"),
         "explore": (
             "cloudpickle",
             "cryptography",

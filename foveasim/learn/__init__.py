@@ -27,12 +27,17 @@ __all__ = [
     "SitePool",
     "barrier",
     "capture",
+    "from_fovi",
     "generated",
+    "physics",
     "site_power",
+    "to_fovi",
+    "transform",
     "undistort",
 ]
 
 if TYPE_CHECKING or find_spec("torch") is not None:
+    from foveasim.learn.adapters import from_fovi, physics, to_fovi, transform
     from foveasim.learn.distortion import undistort
     from foveasim.learn.imaging import Imaging
     from foveasim.learn.integral import site_power

@@ -107,6 +107,8 @@ class SparseMap:
         rows.sum_duplicates()
         self.shape = rows.shape
         self._parts: list[Any] = [rows, rows.T.tocsr()]
+        of_row = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr))
+        self._constants = Constants(row=of_row, column=rows.indices.astype(np.int64), data=rows.data)
         self._tensors: dict[Any, Tensor] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -137,7 +139,12 @@ class SparseMap:
     def apply(self, values: Tensor) -> Tensor:
         """Return the products (..., m) of rows (..., n)."""
         rows = values.reshape(-1, self.shape[1])
-        found = _Product.apply(rows, self, False)  # type: ignore[no-untyped-call]
+        if torch.compiler.is_compiling():  # in operations that other runtimes have
+            get, entries = self._constants.get, rows.new_zeros(rows.shape[0], self.shape[0])
+            products = rows.index_select(1, get("column", rows)) * get("data", rows)
+            found = entries.index_add(1, get("row", rows), products)
+        else:
+            found = _Product.apply(rows, self, False)  # type: ignore[no-untyped-call]
         return found.reshape(*values.shape[:-1], self.shape[0])  # type: ignore[no-any-return]
 
 

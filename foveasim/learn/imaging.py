@@ -260,12 +260,14 @@ class Imaging(nn.Module):
             found.append(torch.einsum("cbk,kyx->cbyx", (per_image * transmittance).to(factors.dtype), factors))
         return found
 
-    def split(self, n_scenes: int, device: torch.device) -> list[slice]:
-        """Return the parts of a batch that are imaged at once."""
+    def split(self, scenes: Tensor) -> list[slice]:
+        """Return the parts of a batch (n_scene, ...) that are imaged at once."""
+        if scenes.device.type != "cpu" or torch.compiler.is_compiling():
+            return [slice(None)]
         n_cells = sum(rows.cells.size * columns.cells.size for _, rows, columns in self._patches)
         n_cells *= self._scene.basis.shape[0] * self._n_modes * self._imaging.oversample**2
-        n = max(1, MAX_PART // n_cells) if device.type == "cpu" else n_scenes
-        return [slice(k, min(k + n, n_scenes)) for k in range(0, n_scenes, n)] or [slice(0, 0)]
+        n, n_scenes = max(1, MAX_PART // n_cells), scenes.shape[0]
+        return [slice(k, min(k + n, n_scenes)) for k in range(0, n_scenes, n)] or [slice(None)]
 
     def filtered(self, basis: Tensor, transfer: Sequence[Tensor], shift: Tensor | None = None) -> Tensor:
         """
@@ -292,8 +294,7 @@ class Imaging(nn.Module):
         flat = basis.reshape(-1, *basis.shape[-3:])
         check_tensor("basis", flat, (None, *shape), ", as the scene", any_device=True)
         parts = [
-            self._filtered(flat[part], transfer, None if shift is None else shift[part])
-            for part in self.split(flat.shape[0], flat.device)
+            self._filtered(flat[part], transfer, None if shift is None else shift[part]) for part in self.split(flat)
         ]
         maps = parts[0] if len(parts) == 1 else torch.cat(parts)
         return maps.reshape(*basis.shape[:-3], *maps.shape[1:])

@@ -126,6 +126,11 @@ class SensorLayer(nn.Module):
         return self.model.n_sites
 
     @property
+    def picture_shape(self) -> tuple[int, ...]:
+        """Rows and columns of the pictures."""
+        return self._shape
+
+    @property
     def max_code(self) -> int:
         """Highest code."""
         return self.readout.sensor.adc.n_codes - 1
@@ -212,9 +217,31 @@ class SensorLayer(nn.Module):
         with _full_precision(pictures):
             rates = [
                 self.model.photo_e_per_s(self._basis(flat[part]), None if gaze_um is None else gaze_um[part])
-                for part in self.model.parts(flat.shape[0], pictures.device)
+                for part in self.model.parts(flat)
             ]
             return (rates[0] if len(rates) == 1 else torch.cat(rates)).reshape(*pictures.shape[:-3], self.n_sites)
+
+    def light_e(self, pictures: Tensor, *, with_dark: bool = False) -> Tensor:
+        """
+        Compute the expected charges of light, a linear function also of negative values.
+
+        Parameters
+        ----------
+        pictures : (..., n_channel, n_y, n_x) tensor
+            Linear values, without a check of their range.
+        with_dark : bool
+            Whether to add the expected dark signal.
+
+        Returns
+        -------
+        (..., n_site) tensor, e-
+        """
+        self._check(pictures)
+        with _full_precision(pictures):
+            rates = self.model.photo_e_per_s(pictures.flip(-2))
+            exposure_s = self.model.exposure_s.to(rates.dtype)
+            total_e = self.readout.expected_e(rates, exposure_s)
+            return total_e if with_dark else total_e - self.readout.expected_e(torch.zeros_like(rates), exposure_s)
 
     def expected_e(self, pictures: Tensor, gaze_um: Tensor | None = None) -> Tensor:
         """

@@ -161,7 +161,12 @@ class Model(nn.Module):
             if not self.imaging.has_patches:
                 weights = _on_columns(weights, self.grid.shape[1], *self.imaging.padded_columns)
             self._matrices = [SparseMap(weights[np.flatnonzero(sensor.filter_of_site == c)]) for c in self._used]
-        self._has_fixed_light = not {*LENS_VARIABLES, "filters", "qe"} & set(self.wrt)
+        self._n_constants = 0
+        if not {*LENS_VARIABLES, "filters", "qe"} & set(self.wrt):
+            with torch.no_grad():
+                found = [interleaved(each).numpy() for each in self._transfer()]
+            self._constants.add(**{f"transfer {k}": each for k, each in enumerate(found)})
+            self._n_constants = len(found)
 
     def __getattr__(self, name: str) -> Any:
         if name == "mesh" and "mesh" not in self._modules:  # built on its first use
@@ -188,26 +193,23 @@ class Model(nn.Module):
             self._moving = _MovingSites(self.mesh, self._camera, self.grid)
         return self._moving.points(self.mesh(), self.distortion, self.distortion_names)
 
-    def transfer(self) -> list[Tensor]:
+    def transfer(self, like: Tensor) -> list[Tensor]:
         """
         Compute the transfer functions from basis images to maps of photoelectrons.
 
+        Parameters
+        ----------
+        like : tensor
+            Basis images: constants have their device and precision.
+
         Returns
         -------
-        list of (n_filter, n_image, n_row, n_column) complex tensors
-            Of :meth:`Imaging.transfer`, for the filters that sites have; constants unless filters or optics are variables.
+        list of (n_filter, n_image, n_row, n_column) tensors
+            As of :meth:`Imaging.transfer`, for the filters that sites have; constants unless filters or optics are variables.
         """
-        if not self._has_fixed_light:
+        if not self._n_constants:
             return self._transfer()
-        with torch.no_grad():
-            like: Tensor = self.exposure_s
-            found: list[Tensor] = []
-            while f"transfer {len(found)}" in self._constants:
-                found.append(self._constants.get(f"transfer {len(found)}", like))
-            if not found:
-                found = [interleaved(each) for each in self._transfer()]
-                self._constants.add(**{f"transfer {k}": each.cpu().numpy() for k, each in enumerate(found)})
-        return found
+        return [self._constants.get(f"transfer {k}", like) for k in range(self._n_constants)]
 
     def _transfer(self) -> list[Tensor]:
         e_per_j = self.filters[self._used] * self.qe[self._used]
@@ -234,12 +236,12 @@ class Model(nn.Module):
         if not isinstance(basis, Tensor) or basis.ndim < 3:
             check_tensor("basis", basis, self._scene.basis.shape, any_device=True)
         shift = None if gaze_um is None else self._shift(basis, gaze_um)
-        transfer, flat = self.transfer(), basis.reshape(-1, *basis.shape[-3:])
+        transfer, flat = self.transfer(basis), basis.reshape(-1, *basis.shape[-3:])
         check_tensor("basis", flat, (None, *self._scene.basis.shape), ", as the scene", any_device=True)
         image = self.imaging.padded if self._matrices and not self.imaging.has_patches else self.imaging.filtered
         rates = [
             self._integrated(image(flat[part], transfer, None if shift is None else shift[part]))
-            for part in self.parts(flat.shape[0], flat.device)
+            for part in self.parts(flat)
         ]
         found = rates[0] if len(rates) == 1 else torch.cat(rates)
         return self._collect(found.reshape(*basis.shape[:-3], self.n_sites) * float(w_from_w_m2_um2(1.0)))
@@ -256,10 +258,10 @@ class Model(nn.Module):
         """
         return [matrix.tensor(like) for matrix in self._matrices]
 
-    def parts(self, n_scenes: int, device: torch.device) -> list[slice]:
-        """Return the parts of a batch that are computed at once."""
+    def parts(self, scenes: Tensor) -> list[slice]:
+        """Return the parts of a batch (n_scene, ...) that are computed at once."""
         # Sites that move are compiled for all maps of the batch.
-        return self.imaging.split(n_scenes, device) if self._matrices else [slice(None)]
+        return self.imaging.split(scenes) if self._matrices else [slice(None)]
 
     def _integrated(self, maps: Tensor) -> Tensor:
         """Return the integrals (n_scene, n_site) of maps over the sites of each filter."""
