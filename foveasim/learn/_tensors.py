@@ -87,9 +87,9 @@ class Constants:
             values = self._values[name]
             precision = like.dtype.to_complex() if values.dtype.kind == "c" else like.dtype.to_real()
             with torch.inference_mode(mode=False):
-                found = torch.from_numpy(np.array(values)).to(like.device)
-                if values.dtype.kind in "fc":
-                    found = found.to(precision)
+                found = torch.from_numpy(np.array(values))
+                # First the precision: some devices have no float64.
+                found = (found.to(precision) if values.dtype.kind in "fc" else found).to(like.device)
             if type(found) is Tensor:  # none of a tracer
                 self._tensors[key] = found
         return found

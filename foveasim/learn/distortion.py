@@ -113,6 +113,8 @@ def undistort(lens: Lens, points: Tensor, coefficients: Tensor | None = None, na
     if coefficients is None:
         coefficients = torch.tensor(coefficient_values(lens, names), dtype=torch.float64)
     coefficients = check_tensor("coefficients", coefficients, (len(names),), ", one per name", any_device=True)
+    if points.device.type == "meta":  # without values: only the shape
+        return points + coefficients.sum()
     return _Undistort.apply(points, coefficients, lens, names)  # type: ignore[no-any-return, no-untyped-call]
 
 

@@ -94,6 +94,9 @@ def site_power(
     check_tensor("maps", flat, (None, *grid.shape), ", as the grid", any_device=True)
     if points.device != maps.device:
         raise ParameterError("maps", f"must be on the device of the points, {points.device}, got {maps.device}")
+    if points.device.type == "meta":  # without values: only the shape
+        found = (flat.sum(dim=(-2, -1))[:, None] + points.sum()).expand(-1, outlines.n_sites)
+        return found.reshape(*maps.shape[:-2], outlines.n_sites)
     if points.device.type != "cpu":
         found = integrate_edges(points, flat, outlines, grid, 2 if order == 2 else 1)
         return found.reshape(*maps.shape[:-2], outlines.n_sites)

@@ -264,6 +264,31 @@ def test_layer_runs_on_devices(output, dtype, device):
     assert pictures.grad.device.type == layer.model.filters.grad.device.type == device.type
 
 
+@pytest.mark.parametrize(
+    ("name", "wrt"),
+    [
+        ("mixing", ("vertices",)),
+        ("distorted", ("vertices", "distortion")),
+        ("aberrated", ("zernike", "defocus")),
+        ("patches", ()),
+    ],
+)
+def test_variables_follow_devices(name, wrt, device):
+    """On other devices than the CPU, vertices use sums over edges in operations of PyTorch."""
+    layer = learn.SensorLayer(
+        camera(**copy.deepcopy(CAMERAS[name])), scene(), wrt, exposure_s=EXPOSURE_S, output="expected"
+    )
+    pictures = torch.rand(2, 3, *SHAPE, dtype=torch.float64)
+    expected = layer(pictures).detach()
+    layer.to(device)(pictures.to(device).requires_grad_()).sum().backward()
+    found = layer(pictures.to(device)).detach()
+
+    assert (found.shape, found.device.type) == (expected.shape, device.type)
+    assert all(value.grad.device.type == device.type for value in layer.parameters())
+    if device.type != "meta":
+        torch.testing.assert_close(found.cpu(), expected, rtol=1e-10, atol=1e-6)
+
+
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_layer_computes_in_single_precision_under_autocast(dtype):
     layer = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S, output="expected")

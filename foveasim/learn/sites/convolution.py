@@ -67,7 +67,8 @@ class SiteConv(nn.Module):
     0, as zero padding. On a square grid, the layer is a :class:`torch.nn.Conv2d` with ``padding="same"``.
 
     Convolution over k nearest neighbours with the kernel in a local frame of reference is that of FOVI: N. M. Blauch,
-    G. A. Alvarez, T. Konkle, "FOVI: a biologically-inspired foveated interface for deep vision models", 2026.
+    G. A. Alvarez, T. Konkle, "FOVI: a biologically-inspired foveated interface for deep vision models", ICML 2026,
+    arXiv:2602.03766.
 
     Examples
     --------
