@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -103,21 +104,19 @@ class SparseMap:
     """
 
     def __init__(self, matrix: Any) -> None:
-        rows = matrix.tocsr()
-        rows.sum_duplicates()
-        self.shape = rows.shape
-        self._parts: list[Any] = [rows, rows.T.tocsr()]
-        of_row = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr))
-        self._constants = Constants(row=of_row, column=rows.indices.astype(np.int64), data=rows.data)
+        self._matrix = matrix.tocsr()
+        self._matrix.sum_duplicates()
+        self.shape = self._matrix.shape
+        self._constants = Constants()
         self._tensors: dict[Any, Tensor] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_tensors": {}}
+        return vars(self) | {"_tensors": {}, "_constants": Constants()}
 
     @property
     def entries(self) -> Any:
         """Elements of the matrix, in COO format with int64 indices."""
-        found = self._parts[0].tocoo()
+        found = self._matrix.tocoo()
         found.coords = tuple(np.asarray(each, np.int64) for each in found.coords)
         return found
 
@@ -126,7 +125,7 @@ class SparseMap:
         key = is_transposed, like.device, like.dtype
         found = self._tensors.get(key)
         if found is None:
-            part = self._parts[int(is_transposed)]
+            part = self._matrix.T.tocsr() if is_transposed else self._matrix
             dtype = np.int32 if part.nnz < 2**31 else np.int64
             index = [torch.from_numpy(np.array(each, dtype)) for each in (part.indptr, part.indices)]
             data = torch.from_numpy(np.array(part.data)).to(like.dtype)
@@ -140,9 +139,11 @@ class SparseMap:
         """Return the products (..., m) of rows (..., n)."""
         rows = values.reshape(-1, self.shape[1])
         if torch.compiler.is_compiling():  # in operations that other runtimes have
-            get, entries = self._constants.get, rows.new_zeros(rows.shape[0], self.shape[0])
-            products = rows.index_select(1, get("column", rows)) * get("data", rows)
-            found = entries.index_add(1, get("row", rows), products)
+            get = partial(self._constants.get, like=rows)
+            data = get("data", compute=lambda: self.entries.data)
+            products = rows.index_select(1, get("column", compute=lambda: self.entries.col)) * data
+            sums = rows.new_zeros(rows.shape[0], self.shape[0])
+            found = sums.index_add(1, get("row", compute=lambda: self.entries.row), products)
         else:
             found = _Product.apply(rows, self, False)  # type: ignore[no-untyped-call]
         return found.reshape(*values.shape[:-1], self.shape[0])  # type: ignore[no-any-return]
@@ -168,6 +169,12 @@ class _Product(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
         return _Product.apply(gradients[0], ctx.matrix, not ctx.is_transposed), None, None  # type: ignore[no-untyped-call]
+
+
+def in_parts(compute: Callable[..., Tensor], parts: Sequence[slice], *tensors: Tensor | None) -> Tensor:
+    """Return the results of a function for parts of the rows of tensors, one after the other."""
+    found = [compute(*(None if each is None else each[part] for each in tensors)) for part in parts]
+    return found[0] if len(found) == 1 else torch.cat(found)
 
 
 def constant(values: Any) -> Tensor:

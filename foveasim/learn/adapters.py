@@ -63,6 +63,10 @@ def physics(layer: SensorLayer, *, generator: torch.Generator | None = None, **o
         raise ParameterError(
             "layer", f"must have linear encoding, got '{layer.encoding}'", hint="decode pictures first"
         )
+    return _physics(layer, generator, options)
+
+
+def _physics(layer: SensorLayer, generator: torch.Generator | None, options: dict[str, Any]) -> Any:
     return _physics_class()(layer, generator, **options)
 
 
@@ -95,6 +99,11 @@ def _physics_class() -> Any:
                 self._dark = layer.light_e(torch.zeros_like(white), with_dark=True)[0]
                 self.unit_e: float = float(layer.light_e(white).max())
             self.noise_model = SensorNoise(self, generator)
+            self._arguments = layer, generator, options
+
+        def __reduce__(self) -> tuple[Any, ...]:
+            # Pickle cannot import a class that is defined in a function.
+            return _physics, self._arguments
 
         def A(self, x: Tensor, **_: Any) -> Tensor:  # noqa: N802 - of deepinv
             return self.layer.light_e(x) / self.unit_e
@@ -161,6 +170,9 @@ def _transform_class() -> Any:
             super().__init__()
             self.layer = layer
 
+        def __reduce__(self) -> tuple[Any, ...]:
+            return transform, (self.layer,)
+
         def transform(self, inpt: Any, params: dict[str, Any]) -> Tensor:
             del params
             picture = v2.functional.to_dtype(
@@ -206,6 +218,8 @@ def from_fovi(samples: Any, *, radius_um: Annotated[float, RADIUS]) -> Layout:
     centres_um = radius_um * finite_array("samples", np.asarray(array, np.float64), ndim=2)
     if centres_um.shape[1:] != (2,) or centres_um.shape[0] < 2:
         raise ParameterError("samples", f"must have the shape (n_site, 2), got {centres_um.shape}")
+    if np.unique(centres_um, axis=0).shape != centres_um.shape:
+        raise ParameterError("samples", "must be at different positions")
     distance_um = np.hypot(*centres_um.T)
     outer = int(np.argmax(distance_um))
     others = np.delete(np.hypot(*(centres_um - centres_um[outer]).T), outer)

@@ -24,7 +24,7 @@ from foveasim._core.validation import Floats, Ints
 from foveasim._io.mapped_files import in_memory
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, SceneLike
-from foveasim.learn._tensors import Constants, check_tensor, constant
+from foveasim.learn._tensors import Constants, check_tensor, constant, in_parts
 from foveasim.optics import Optics, PupilImage, Seidel, Zernike, zernike
 from foveasim.optics._aperture import PUPIL_POINTS, Aperture, overlaps
 from foveasim.optics._imaging import PatchExtent
@@ -293,13 +293,10 @@ class Imaging(nn.Module):
             check_tensor("basis", basis, shape, any_device=True)
         flat = basis.reshape(-1, *basis.shape[-3:])
         check_tensor("basis", flat, (None, *shape), ", as the scene", any_device=True)
-        parts = [
-            self._filtered(flat[part], transfer, None if shift is None else shift[part]) for part in self.split(flat)
-        ]
-        maps = parts[0] if len(parts) == 1 else torch.cat(parts)
+        maps = in_parts(partial(self._filtered, transfer), self.split(flat), flat, shift)
         return maps.reshape(*basis.shape[:-3], *maps.shape[1:])
 
-    def _filtered(self, basis: Tensor, transfer: Sequence[Tensor], shift: Tensor | None) -> Tensor:
+    def _filtered(self, transfer: Sequence[Tensor], basis: Tensor, shift: Tensor | None) -> Tensor:
         maps = None
         for number in range(len(self._patches)):
             (to_y, to_x), (from_y, from_x) = self._cells[number]

@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from foveasim.camera import Camera
-from foveasim.errors import ParameterError, type_name
-from foveasim.learn._tensors import check_tensor
+from foveasim.errors import ParameterError
+from foveasim.learn._tensors import check_tensor, in_parts
 from foveasim.learn.model import Model
 from foveasim.learn.readout import Readout
 from foveasim.scene import Scene
+from foveasim.sensor.limits import EXPOSURE
 
 __all__ = ["SensorLayer"]
 
@@ -97,7 +98,7 @@ class SensorLayer(nn.Module):
         wrt: Iterable[str] = (),
         *,
         scene_shape: tuple[int, ...] | None = None,
-        exposure_s: float | None = None,
+        exposure_s: Annotated[float | None, EXPOSURE] = None,
         encoding: Literal["linear", "srgb", "sqrt"] = "linear",
         output: Output = "code",
         noise: bool = True,
@@ -146,10 +147,6 @@ class SensorLayer(nn.Module):
 
     def _check(self, pictures: Tensor) -> None:
         """Raise unless pictures have the type, shape and device of this layer."""
-        if not isinstance(pictures, Tensor):
-            raise ParameterError(
-                "pictures", f"must be a torch.Tensor, got {type_name(pictures)}", hint="use torch.as_tensor"
-            )
         if not pictures.is_floating_point():
             raise ParameterError(
                 "pictures",
@@ -215,11 +212,12 @@ class SensorLayer(nn.Module):
         if gaze_um is not None:
             check_tensor("gaze_um", gaze_um, (flat.shape[0], 2), ", one row (x, y) per picture", any_device=True)
         with _full_precision(pictures):
-            rates = [
-                self.model.photo_e_per_s(self._basis(flat[part]), None if gaze_um is None else gaze_um[part])
-                for part in self.model.parts(flat)
-            ]
-            return (rates[0] if len(rates) == 1 else torch.cat(rates)).reshape(*pictures.shape[:-3], self.n_sites)
+            # Parts of a batch are checked and decoded while they are in the cache.
+            rates = in_parts(
+                lambda part, gaze: self.model.photo_e_per_s(self._basis(part), gaze),
+                self.model.parts(flat), flat, gaze_um,
+            )  # fmt: skip
+            return rates.reshape(*pictures.shape[:-3], self.n_sites)
 
     def light_e(self, pictures: Tensor, *, with_dark: bool = False) -> Tensor:
         """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from foveasim.camera._footprints import placed
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator, UndistortedOutlines
-from foveasim.learn._tensors import Constants, SparseMap, check_tensor, constant
+from foveasim.learn._tensors import Constants, SparseMap, check_tensor, constant, in_parts
 from foveasim.learn.distortion import coefficient_names, coefficient_values, undistort, with_coefficients
 from foveasim.learn.imaging import VARIABLES as LENS_VARIABLES
 from foveasim.learn.imaging import Imaging, _check_variables, interleaved
@@ -28,6 +28,7 @@ from foveasim.learn.outlines import Outlines
 from foveasim.learn.readout import Readout
 from foveasim.scene import Scene
 from foveasim.sensor import ConstantCurve, FilterSet, TableCurve
+from foveasim.sensor.limits import EXPOSURE
 from foveasim.units import photon_energy_j, w_from_w_m2_um2
 
 __all__ = ["VARIABLES", "Model", "capture"]
@@ -97,7 +98,7 @@ class Model(nn.Module):
         scene: Scene,
         wrt: Iterable[str] = ("vertices",),
         *,
-        exposure_s: float,
+        exposure_s: Annotated[float, EXPOSURE],
         boundary: Literal["fixed", "sliding", "free"] = "fixed",
     ) -> None:
         super().__init__()
@@ -239,11 +240,11 @@ class Model(nn.Module):
         transfer, flat = self.transfer(basis), basis.reshape(-1, *basis.shape[-3:])
         check_tensor("basis", flat, (None, *self._scene.basis.shape), ", as the scene", any_device=True)
         image = self.imaging.padded if self._matrices and not self.imaging.has_patches else self.imaging.filtered
-        rates = [
-            self._integrated(image(flat[part], transfer, None if shift is None else shift[part]))
-            for part in self.parts(flat)
-        ]
-        found = rates[0] if len(rates) == 1 else torch.cat(rates)
+
+        def integrated(part: Tensor, shift: Tensor | None) -> Tensor:
+            return self._integrated(image(part, transfer, shift))
+
+        found = in_parts(integrated, self.parts(flat), flat, shift)
         return self._collect(found.reshape(*basis.shape[:-3], self.n_sites) * float(w_from_w_m2_um2(1.0)))
 
     def overlaps(self, like: Tensor) -> list[Tensor]:
@@ -282,6 +283,10 @@ class Model(nn.Module):
         """Return gazes in cells of the maps, (n_scene, 2)."""
         n_scenes = math.prod(basis.shape[:-3])
         check_tensor("gaze_um", gaze_um, (n_scenes, 2), ", one row (x, y) per picture", any_device=True)
+        if gaze_um.device != basis.device:
+            raise ParameterError(
+                "gaze_um", f"must be on the device of the pictures, {basis.device}, got {gaze_um.device}"
+            )
         camera = self._camera
         if camera.axis == "image" and camera.distortion is not None:
             raise ParameterError(
@@ -416,7 +421,12 @@ def _curve(wavelength_nm: Any, values: Any) -> Any:
 
 
 def capture(
-    camera: Camera, scene: Scene, wrt: Iterable[str] = ("vertices",), *, exposure_s: float, **options: Any
+    camera: Camera,
+    scene: Scene,
+    wrt: Iterable[str] = ("vertices",),
+    *,
+    exposure_s: Annotated[float, EXPOSURE],
+    **options: Any,
 ) -> tuple[Tensor, Model]:
     """
     Compute the expected charges of a capture, with gradients to parts of the camera.

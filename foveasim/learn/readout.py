@@ -13,6 +13,7 @@ from torch import Tensor
 from foveasim.errors import ParameterError
 from foveasim.learn._tensors import Constants, SparseMap, check_tensor
 from foveasim.sensor import Sensor
+from foveasim.sensor.adc import CODE_ROUNDING
 from foveasim.sensor.effects.crosstalk import CrosstalkOperator
 from foveasim.sensor.model.prediction import MIN_SLOPE
 from foveasim.sensor.model.tabulation import Curve, LocalStep, tabulate
@@ -25,8 +26,6 @@ MAX_PROBABILITIES = 2**22
 MIN_VARIANCE = 1e-12
 #: Distance from the full well, in standard deviations, from which it clips nothing.
 CLIPPED_SIGMAS = 8.0
-#: Value, in codes, that counts as rounding where a code begins.
-CODE_ROUNDING = 1e-9
 
 
 class Readout:
@@ -80,8 +79,10 @@ class Readout:
         ]
         self._collection = _Local(steps.collection, n)
         self._charge = _built(steps.charge, n)
-        self._sense, self._output = _built(steps.sense, n), _built(steps.output, n)
-        self._has_signal_noise = any(step.is_noisy for step in (*self._sense, *self._output))
+        # From charges to voltages at the ADC.
+        response = _Response(steps.nonlinearity_fraction, steps.v_sat_v)
+        self._signal = [*_built(steps.sense, n), response, *_built(steps.output, n)]
+        self._has_signal_noise = any(step.is_noisy for step in self._signal)
         if steps.dnl_dn is not None:
             first_offset = steps.line_of_site * sensor.adc.n_codes
             self._constants.add(dnl_dn=steps.dnl_dn.ravel(), first_offset=first_offset)
@@ -93,10 +94,8 @@ class Readout:
         if not isinstance(values, Tensor) or values.ndim == 0:
             check_tensor(name, values, (self._n_sites,), " or (..., n_site)", any_device=True)
         assert isinstance(values, Tensor)
-        shape, expected = values.shape, (*([None] * (values.ndim - 1)), self._n_sites)
-        check_tensor(name, values, expected, ", with one column per site", any_device=True)
-        assert values.shape == shape
-        return values
+        expected = (*([None] * (values.ndim - 1)), self._n_sites)
+        return check_tensor(name, values, expected, ", with one column per site", any_device=True)
 
     def expected_e(self, photo_e_per_s: Tensor, exposure_s: Tensor | float) -> Tensor:
         """
@@ -150,8 +149,8 @@ class Readout:
         moments = self._moments(expected_e)
         if not self._has_signal_noise:
             return moments.total
-        added = self._signal(moments._replace(variance=torch.zeros_like(moments.variance), groups=()))
-        return moments.total + added.moments.total / (added.slope * added.slope)
+        added = _propagate(_Moments(moments.mean, torch.zeros_like(moments.mean), ()), self._signal)
+        return moments.total + added.total / torch.square(self._transfer(moments.mean)[1])
 
     def draw(self, expected_e: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """
@@ -184,13 +183,9 @@ class Readout:
         if not self._has_signal_noise:
             return charge_e
         volts, added = charge_e, torch.zeros_like(charge_e)
-        for part in (self._sense, self._output):
-            for step in part:
-                added = step.slope(volts) * added + step.noise(volts, generator)
-                volts = step.mean(volts)
-            if part is self._sense:
-                volts, slope = self._response(volts)
-                added = slope * added
+        for step in self._signal:
+            added = step.slope(volts) * added + step.noise(volts, generator)
+            volts = step.mean(volts)
         return charge_e + added / self._transfer(charge_e)[1]
 
     # -- voltages and codes -----------------------------------------------------------------------------------------
@@ -211,38 +206,12 @@ class Readout:
         """
         return self._transfer(self._check("charge_e", charge_e))[0]
 
-    def _response(self, volts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return voltages after the response nonlinearity, and its slope."""
-        loss, v_sat_v = self._steps.nonlinearity_fraction, self._steps.v_sat_v
-        if not loss:
-            return volts, torch.ones_like(volts)
-        fraction = torch.clamp(volts / v_sat_v, 0.0, 1.0)
-        is_within = (volts > 0.0) & (volts < v_sat_v)
-        slope = (1.0 - torch.where(is_within, 2.0, 1.0) * loss * fraction).clamp_min(MIN_SLOPE)
-        return volts * (1.0 - loss * fraction), slope
-
-    def _signal(self, moments: _Moments) -> _Signal:
-        """Return the moments of the voltages at the ADC, and the slope of their mean."""
-        slope = torch.ones_like(moments.mean)
-        for part in (self._sense, self._output):
-            for step in part:
-                slope = slope * step.slope(moments.mean)
-                moments = step.propagate(moments)
-            if part is self._sense:
-                volts, response = self._response(moments.mean)
-                slope, moments = slope * response, moments.scaled(volts, response)
-        return _Signal(moments, slope)
-
     def _transfer(self, charge_e: Tensor) -> tuple[Tensor, Tensor]:
         """Return the voltages of charges, and the derivatives of the voltages."""
         volts, slope = charge_e, torch.ones_like(charge_e)
-        for part in (self._sense, self._output):
-            for step in part:
-                slope = slope * step.slope(volts)
-                volts = step.mean(volts)
-            if part is self._sense:
-                volts, response = self._response(volts)
-                slope = slope * response
+        for step in self._signal:
+            slope = slope * step.slope(volts)
+            volts = step.mean(volts)
         return volts, slope
 
     def code(self, charge_e: Tensor, *, adc: Literal["straight_through", "linear"] = "straight_through") -> Tensor:
@@ -293,10 +262,11 @@ class Readout:
             Sum over all codes of the probability that the voltage exceeds the transition level. The noise is Gaussian; DNL is
             not included.
         """
-        signal = self._signal(self._moments(self._check("expected_e", expected_e)))
-        mean_v, variance_v2 = signal.moments.mean, signal.moments.total
-        smallest_v2 = (signal.slope * signal.slope * MIN_VARIANCE).clamp_min(torch.finfo(mean_v.dtype).tiny)
-        deviation = torch.sqrt(torch.maximum(variance_v2, smallest_v2))
+        moments = self._moments(self._check("expected_e", expected_e))
+        signal = _propagate(moments, self._signal)
+        mean_v, slope = signal.mean, self._transfer(moments.mean)[1]
+        smallest_v2 = (slope * slope * MIN_VARIANCE).clamp_min(torch.finfo(mean_v.dtype).tiny)
+        deviation = torch.sqrt(torch.maximum(signal.total, smallest_v2))
         levels = self._constants.get("level_v", mean_v)
         flat, width = mean_v.reshape(-1), (deviation * math.sqrt(2.0)).reshape(-1)
         n = max(1, MAX_PROBABILITIES // levels.numel())
@@ -343,11 +313,6 @@ class _Moments(NamedTuple):
         return _Moments(mean, self.variance * (slope * slope), groups)
 
 
-class _Signal(NamedTuple):
-    moments: _Moments
-    slope: Tensor
-
-
 def _propagate(moments: _Moments, steps: Iterable[Any]) -> _Moments:
     for step in steps:
         moments = step.propagate(moments)
@@ -356,6 +321,34 @@ def _propagate(moments: _Moments, steps: Iterable[Any]) -> _Moments:
 
 def _built(steps: Sequence[LocalStep | CrosstalkOperator], n_sites: int) -> list[Any]:
     return [_Local(step, n_sites) if isinstance(step, LocalStep) else _Mixing(step) for step in steps]
+
+
+class _Response:
+    """Quadratic response nonlinearity."""
+
+    is_noisy = False
+
+    def __init__(self, nonlinearity_fraction: float, v_sat_v: float) -> None:
+        self._loss, self._v_sat_v = nonlinearity_fraction, v_sat_v
+
+    def mean(self, volts: Tensor) -> Tensor:
+        """Return the voltages after the nonlinearity."""
+        return volts * (1.0 - self._loss * torch.clamp(volts / self._v_sat_v, 0.0, 1.0)) if self._loss else volts
+
+    def slope(self, volts: Tensor) -> Tensor:
+        """Return the derivative; outside the range the relative loss is constant."""
+        fraction = torch.clamp(volts / self._v_sat_v, 0.0, 1.0)
+        is_within = (volts > 0.0) & (volts < self._v_sat_v)
+        return (1.0 - torch.where(is_within, 2.0, 1.0) * self._loss * fraction).clamp_min(MIN_SLOPE)
+
+    def noise(self, volts: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Return no noise."""
+        del generator
+        return torch.zeros_like(volts)
+
+    def propagate(self, moments: _Moments) -> _Moments:
+        """Return the moments after the step."""
+        return moments.scaled(self.mean(moments.mean), self.slope(moments.mean))
 
 
 class _Mixing:

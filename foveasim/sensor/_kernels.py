@@ -14,14 +14,12 @@ from numba import types
 
 from foveasim._core._kernels import BATCH, fill_normals, fill_uniforms, philox_2x32, philox_4x64, uniform
 from foveasim._core.jit import njit
-from foveasim.sensor.adc import ConversionTables
+from foveasim.sensor.adc import CODE_ROUNDING, ConversionTables
 from foveasim.sensor.effects.shot import PoissonTables
 from foveasim.sensor.model.prediction import ChargeDistributions, ChargeTables, Transfer
 
 #: ADC transfer functions, as numbered by ``ConversionTables.companding_index``.
 ADC_LINEAR, ADC_ROOT, ADC_LOG, ADC_TABLE = range(4)
-#: Tolerance of code transitions, in codes: covers the rounding error of a division.
-CODE_ROUNDING = 1e-9
 #: Variance of rounding to integers: a uniform distribution of width 1.
 ROUNDING_VARIANCE = np.float32(1.0 / 12.0)
 #: Quadratic coefficient of the Poisson approximation and its 1/λ correction: see foveasim.sensor.effects.ShotNoise.

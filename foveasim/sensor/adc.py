@@ -26,6 +26,8 @@ DNL = Limits(at_least=0.0, at_most=2.0**16, hint="deviations are in codes")
 INL = Limits(low=-(2.0**16), at_most=2.0**16, hint="deviations are in codes")
 #: Number of tabulated Gaussian quantiles for differential nonlinearity, interpolated linearly.
 N_QUANTILES = 4096
+#: Tolerance of code transitions, in codes: covers the rounding error of a division.
+CODE_ROUNDING = 1e-9
 #: Quantisation variance in units of the squared code width: a uniform distribution over one code.
 QUANTISATION_DN2 = 1.0 / 12.0
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -58,6 +60,17 @@ def test_least_squares_reproduce_readings():
     found = problem.A_dagger(readings)
 
     assert float((problem.A(found) - readings).norm()) < 1e-3 * float(readings.norm())
+
+
+def test_adapters_can_be_pickled_after_use():
+    pytest.importorskip("deepinv")
+    problem, picture = learn.physics(layer(), max_iter=30), torch.rand(1, 3, *SHAPE)
+    readings = problem.A(picture)
+    again = pickle.loads(pickle.dumps(problem))
+    assert again.max_iter == 30
+    assert torch.equal(again.A(picture), readings)
+    change = learn.transform(layer(output="expected"))
+    assert torch.equal(pickle.loads(pickle.dumps(change))(picture[0]), change(picture[0]))
 
 
 def test_physics_rejects_encoded_pictures():
@@ -157,6 +170,8 @@ def test_samples_lie_in_their_sites():
         (np.zeros(5), "'samples'"),
         (np.zeros((5, 3)), r"\(n_site, 2\)"),
         (np.full((5, 2), np.nan), "'samples' must be finite"),
+        (np.zeros((5, 2)), "'samples' must be at different positions"),
+        (np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.0], [1.0, 0.0]]), "'samples' must be at different positions"),
     ],
 )
 def test_wrong_samples_are_rejected(samples, message):

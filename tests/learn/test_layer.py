@@ -239,6 +239,7 @@ def test_gaze_is_found_by_descent():
         ("pixel optics", [[0.0, 0.0]], "pixel optics"),
         ("moved", [0.0, 0.0], "'gaze_um' must have the shape"),
         ("moved", [[0.0, 0.0, 0.0]], "'gaze_um' must have the shape"),
+        ("moved", [[0, 0]], "'gaze_um' must be a tensor of floating-point numbers"),
     ],
 )
 def test_impossible_gazes_are_rejected(name, gaze_um, message):
@@ -388,6 +389,18 @@ def test_wrong_pictures_are_rejected(pictures, message):
     layer = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S)
     with pytest.raises(fs.FoveasimError, match=message):
         layer(pictures)
+
+
+@pytest.mark.parametrize("exposure_s", [-1.0, 1e9, float("nan")])
+def test_wrong_exposures_are_rejected(exposure_s):
+    with pytest.raises(fs.FoveasimError, match="'exposure_s' must be"):
+        learn.SensorLayer(camera(), scene(), exposure_s=exposure_s)
+
+
+def test_gazes_of_another_device_are_rejected():
+    layer = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S)
+    with pytest.raises(fs.FoveasimError, match="'gaze_um' must be on the device of the pictures, cpu, got meta"):
+        layer(PICTURES, torch.zeros(2, 2, device="meta"))
 
 
 def test_pictures_of_another_device_are_rejected():
