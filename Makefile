@@ -51,8 +51,8 @@ test-lowest: $(LOWEST)/.installed
 test-torch: $(TORCH_VENV)/.installed
 	FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) foveasim/learn tests/learn tests/integrate/test_vertex_gradient.py \
 		tests/explore/test_dataset_torch.py $(PYTEST_ARGS)
-	FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) tests/test_docs.py tests/test_gallery.py tests/test_notebooks.py \
-		-k "torch or learning" $(PYTEST_ARGS)
+	FOVEASIM_TESTS_NEED=torch,deepinv,torchvision $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) tests/test_docs.py tests/test_gallery.py \
+		tests/test_notebooks.py tests/installation -k "torch or learn or adapters" $(PYTEST_ARGS)
 
 # Kills workers at random for some minutes: every item must be computed, at most twice.
 soak: $(VENV)/.installed-dev

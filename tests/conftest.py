@@ -4,7 +4,7 @@ Selection of tests, their requirements, kernels, and distribution to processes.
 The default run leaves out tests marked ``slow`` and tests in a browser, except for those that ``slow(keep=...)`` selects: a
 number of parameter sets of each function, spread evenly, or parts of their names; its random tests have a third of the
 examples. Runs of named files and directories, and those with FOVEASIM_TESTS_ALL=1, contain all tests. ``needs("renderer")``,
-``"chromium"``, ``"torch"`` mark requirements.
+``"chromium"``, ``"torch"`` and other modules mark requirements.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import shutil
 import signal
 import sys
 from collections import defaultdict
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -42,11 +43,16 @@ def chromium_is_missing():
     return None if shutil.which("chromium") else "no chromium on the path"
 
 
-def torch_is_missing():
-    return None if find_spec("torch") else "no torch: make test-torch runs this test"
+def is_missing(module):
+    """Return why the tests of a module of the environment of PyTorch cannot run, or None."""
+    return None if find_spec(module) else f"no {module}: make test-torch runs this test"
 
 
-MISSING = {"renderer": renderer_is_missing, "chromium": chromium_is_missing, "torch": torch_is_missing}
+MISSING = {
+    "renderer": renderer_is_missing,
+    "chromium": chromium_is_missing,
+    **{module: partial(is_missing, module) for module in ("deepinv", "torch", "torchvision")},
+}
 
 
 #: Files with slow tests that share no fixture: each of their tests may run in any process, after all other files, so that the

@@ -2,8 +2,8 @@
 Gradients with respect to photosites, optics and electronics, for PyTorch.
 
 Cameras are layers of networks on any device; layouts with variable vertices use the kernels of the simulator on the CPU, and
-operations of PyTorch elsewhere. Requires the extra
-``learn``: without PyTorch the module has no names, and their use raises an ImportError.
+operations of PyTorch elsewhere. Requires the extra ``learn``, and for :func:`physics` and :func:`transform` the extra
+``adapters``: without PyTorch the module has no names, and their use raises an ImportError.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ else:
 
     def __getattr__(name: str) -> Any:
         if name in __all__:
-            raise ImportError(f"{__name__}.{name} {needs('torch')}", name=__name__)
+            extra = "adapters" if name in ("physics", "transform") else "learn"
+            raise ImportError(f"{__name__}.{name} {needs('torch', extra)}", name=__name__)
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
     def __dir__() -> list[str]:

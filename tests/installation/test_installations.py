@@ -17,6 +17,8 @@ pytestmark = pytest.mark.slow
 
 #: Extras with modules that the package imports.
 EXTRAS = sorted(set(EXTRA_OF.values()))
+#: Libraries of extras that the environment of the tests may lack.
+BEYOND_DEV = {"adapters": ("deepinv", "torchvision"), "learn": ("torch",)}
 MODULES = (
     "", "compare", "config", "distortion", "explore", "layout", "learn", "maps", "metrics", "modes", "optics", "reconstruct",
     "scene", "scene.charts", "sensor", "sensor.effects", "studio", "testing", "tiles", "units", "video", "view",
@@ -68,7 +70,7 @@ def test_core_installation_works_or_names_extra(core):
 
 @pytest.mark.parametrize(
     "extra",
-    [pytest.param(extra, marks=pytest.mark.needs("torch") if extra == "learn" else ()) for extra in EXTRAS],
+    [pytest.param(extra, marks=[pytest.mark.needs(what) for what in BEYOND_DEV.get(extra, ())]) for extra in EXTRAS],
 )
 def test_single_extra_suffices_for_its_calls(core, extra, tmp_path):
     names = [name for name, required in core.items() if required]
