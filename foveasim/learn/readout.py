@@ -237,8 +237,11 @@ class Readout:
             index = torch.floor(at * n_codes + CODE_ROUNDING).clamp(0, n_codes - 1).long()
         else:
             index = (torch.searchsorted(levels, at.contiguous(), right=True) - 1).clamp(0, n_codes - 1)
-        low = levels[index]
-        value = index.to(fraction.dtype) + (position - low) / (levels[index + 1] - low).clamp_min(1e-12)
+        if self.sensor.adc.is_linear:
+            value = position * n_codes
+        else:
+            low = levels[index]
+            value = index.to(fraction.dtype) + (position - low) / (levels[index + 1] - low).clamp_min(1e-12)
         linear = torch.clamp(value - 0.5, 0.0, n_codes - 1.0)
         if adc == "linear":
             return linear
@@ -456,11 +459,10 @@ class _Local:
         if self._step.distribution == "poisson":
             with torch.no_grad():
                 count = torch.poisson(values.clamp_min(0.0), generator)
-                deviation = torch.sqrt(values.clamp_min(MIN_VARIANCE))
-                standard = (count - values) / deviation
             if not values.requires_grad:
                 return count
-            drawn = values + torch.sqrt(values.clamp_min(MIN_VARIANCE)) * standard
+            deviation = torch.sqrt(values.clamp_min(MIN_VARIANCE))
+            drawn = values + deviation * ((count - values) / deviation).detach()
             return drawn + (count - drawn).detach()
         return self.mean(values) + self.noise(values, generator)
 

@@ -204,15 +204,16 @@ def test_gaze_agrees_with_camera(axis, gaze_cells, order, limit):
     np.testing.assert_allclose(found.numpy(), expected_e, rtol=0, atol=limit * expected_e.max())
 
 
-def test_path_of_gazes_is_a_sequence():
+@pytest.mark.parametrize("leading", [(), (2,), (2, 3)])
+def test_path_of_gazes_is_a_sequence(leading):
     light = scene()
     layer = learn.SensorLayer(camera(), light, exposure_s=EXPOSURE_S, output="expected")
-    pictures = torch.rand(2, 3, *SHAPE, dtype=torch.float64)
-    path = torch.rand(2, 4, 2, dtype=torch.float64)
+    pictures = torch.rand(*leading, 3, *SHAPE, dtype=torch.float64)
+    path = torch.rand(*leading, 4, 2, dtype=torch.float64)
     found = layer(pictures, path)
 
-    assert found.shape == (2, 4, layer.n_sites)
-    torch.testing.assert_close(found[:, 2], layer(pictures, path[:, 2]), rtol=1e-12, atol=1e-9)
+    assert found.shape == (*leading, 4, layer.n_sites)
+    torch.testing.assert_close(found[..., 2, :], layer(pictures, path[..., 2, :]), rtol=1e-12, atol=1e-9)
 
 
 def test_gaze_is_found_by_descent():
