@@ -124,7 +124,10 @@ class Imaging(nn.Module):
         self._computed: dict[Any, Any] = {}
         self._patches = self._extents()
         self._cells = [_slices(self._imaging.patch_cells(*each[1:])) for each in self._patches]
-        self._sources = [_Padding(*each[1:], self._imaging.patch_window(*each[1:]), scene.basis.shape[1]) for each in self._patches]
+        self._sources = [
+            _Padding(rows, columns, self._imaging.patch_window(rows, columns), scene.basis.shape[1])
+            for _, rows, columns in self._patches
+        ]
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name not in ("_imaging", "_tables_at")}
@@ -264,7 +267,7 @@ class Imaging(nn.Module):
         return found
 
     def split(self, scenes: Tensor, n_shifts: int = 1) -> list[slice]:
-        """Return the parts of a batch (n_scene, ...) that are imaged at once, with a number of shifts each."""
+        """Return the parts of a batch that are imaged at once, with some shifts each."""
         if scenes.device.type != "cpu" or torch.compiler.is_compiling():
             return [slice(None)]
         n_cells = sum(rows.cells.size * columns.cells.size for _, rows, columns in self._patches)
@@ -306,7 +309,9 @@ class Imaging(nn.Module):
         is_padded: bool = False,
     ) -> Iterator[Tensor]:
         """
-        Compute the maps of one output after the other, which stay in the cache of the processor.
+        Compute the maps of one output after the other.
+
+        They stay in the cache of the processor.
 
         Parameters
         ----------
@@ -360,7 +365,7 @@ class Imaging(nn.Module):
         return [((0.0, 0.0), rows, columns)]
 
     def _outputs(self, spectra: Tensor, number: int, transfer: Tensor, of_rows: slice) -> Iterator[Tensor]:
-        """Yield some rows of the maps (n_scene * n_shift, n_row, k n_column) of a patch, for each output."""
+        """Yield rows of the maps (n_scene * n_shift, n_row, k n_column) of each output."""
         n_columns = self._imaging.oversample * self._patches[number][2].cells.size
         is_real = not transfer.is_complex()
         if is_real:  # interleaved, once for real and imaginary parts
@@ -375,7 +380,7 @@ class Imaging(nn.Module):
             yield torch.fft.irfft(torch.fft.ifft(total, dim=-2)[..., of_rows, :], n_columns)
 
     def _spectra(self, basis: Tensor, number: int, shift: Tensor | None, origin: Origin) -> Tensor:
-        """Return the spectra of the padded images of a patch, (n_scene * n_shift, n_image, n_row, n_column)."""
+        """Return the spectra (n_scene * n_shift, n_image, ...) of the padded images."""
         # Each pair of an image and a mode is an image.
         if self._n_modes > 1:
             weights = self._constants.get("field_weights", basis)
@@ -395,10 +400,8 @@ class Imaging(nn.Module):
             ]
             spectra = spectra * get(f"phase {number}", compute=lambda: self._phase(n_y, n_x))
         if shift is not None:
-            cycles_x, cycles_y = (
-                get(f"cycles {axis} {number}", compute=lambda axis=axis: self._cycles(n_y, n_x)["xy".index(axis)])
-                for axis in "xy"
-            )
+            cycles_x = get(f"cycles x {number}", compute=lambda: self._cycles(n_y, n_x)[0])
+            cycles_y = get(f"cycles y {number}", compute=lambda: self._cycles(n_y, n_x)[1])
             along_x, along_y = _shifted(cycles_x, shift[..., 0]), _shifted(cycles_y, shift[..., 1])
             spectra = spectra[:, None] * along_x[:, :, None, None, :] * along_y[:, :, None, :, None]
             spectra = spectra.flatten(0, 1)
