@@ -4,8 +4,8 @@ Cameras as layers of PyTorch, against their Fourier transforms and sparse produc
     python benchmarks/sensor_layers.py             everything (make bench-torch)
     python benchmarks/sensor_layers.py --quick     small batches, without bounds
 
-Runs on a GPU where PyTorch has one, and then prints the memory bandwidth that the layer achieves. On a CPU, pin the threads
-with OMP_PROC_BIND=true, as make does: threads that change cores leave their caches behind.
+Runs on a GPU where PyTorch has one, and prints the rate at which the layer moves data relative to a copy in memory. On a CPU,
+pin the threads with OMP_PROC_BIND=true, as make does: threads that change cores leave their caches behind.
 """
 
 from __future__ import annotations
@@ -74,11 +74,16 @@ def bench_layer(report: Report, n_pictures: int, n_pixels: int, device: torch.de
     report.slower_than(name, times["layer"], "transforms and sparse products", limit_s, OVER_LIMIT)
     per_s = n_pictures / times["layer"]
     report.add("the same", f"{per_s:.4g} / s", "pictures per second (inverse)", "", PICTURES_PER_S / per_s, 1.0)
-    if device.type == "cuda":
-        n_bytes = 4 * (pictures.numel() + 4 * n_pictures * 3 * width * width)
-        console.print(
-            f"{torch.cuda.get_device_name()}: {n_bytes / times['layer'] / 1e9:.3g} GB/s of pictures and spectra"
-        )
+    # Pictures are read; padded pictures, spectra, products and maps are written and read.
+    n_bytes = padded.element_size() * (pictures.numel() + 2 * 4 * padded.numel())
+    layer_gb_s = 1e-9 * n_bytes / times["layer"]
+    copied = torch.empty_like(padded)
+    copy_s = best_s({"copy": synchronised(lambda: copied.copy_(padded))}, 7)["copy"]  # type: ignore[dict-item]
+    copy_gb_s = 1e-9 * 2 * padded.numel() * padded.element_size() / copy_s
+    name = torch.cuda.get_device_name() if device.type == "cuda" else "CPU"
+    console.print(
+        f"{name}: {layer_gb_s:.3g} GB/s of pictures, spectra and maps, {layer_gb_s / copy_gb_s:.2f} x a copy in memory"
+    )
 
 
 def bench_training(report: Report, n_pictures: int, n_pixels: int, device: torch.device) -> None:
