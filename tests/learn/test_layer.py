@@ -107,6 +107,17 @@ def test_layer_agrees_with_camera_with_its_parts(name):
     assert torch.equal(layer(pictures_of(light)), noiseless) or name == "converter"
 
 
+@pytest.mark.parametrize("name", ["moved", "modes", "patches"])
+def test_first_row_may_be_the_top_one(name):
+    light = scene()
+    model = learn.Model(camera(**copy.deepcopy(CAMERAS[name])), light, (), exposure_s=EXPOSURE_S)
+    basis = torch.from_numpy(np.array(light.basis, np.float64))
+
+    assert torch.equal(model.photo_e_per_s(basis.flip(-2), origin="upper"), model.photo_e_per_s(basis))
+    with pytest.raises(fs.FoveasimError, match="'origin' must be one of 'lower', 'upper', got 'top'"):
+        model.photo_e_per_s(basis, origin="top")
+
+
 def test_layer_reads_charges_as_the_sensor():
     """Without temporal noise, with all conversions, for whole electrons."""
     original = camera(**CAMERAS["converter"], read_noise_e=0.0, shot_noise="off", ktc_noise=False)
