@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -50,6 +51,18 @@ def check_tensor(
         expected = ", ".join("n" if n is None else str(n) for n in shape)
         raise ParameterError(name, f"must have the shape ({expected}){description}, got {sizes}")
     return value
+
+
+def checked_gazes(gaze_um: object, scenes: Sequence[int]) -> Tensor:
+    """
+    Check gazes (..., 2), or paths of gazes (..., n_gaze, 2), of scenes (...).
+
+    Returns them as (n_scene, n_gaze, 2).
+    """
+    is_path = isinstance(gaze_um, Tensor) and gaze_um.ndim == len(scenes) + 2
+    expected = (*scenes, None, 2) if is_path else (*scenes, 2)
+    found = check_tensor("gaze_um", gaze_um, expected, ", one row (x, y) per picture, or a path", any_device=True)
+    return found.reshape(math.prod(scenes), found.shape[-2] if is_path else 1, 2)
 
 
 def as_array(tensor: Tensor) -> NDArray[Any]:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from foveasim.camera import Camera
 from foveasim.errors import ParameterError
-from foveasim.learn._tensors import check_tensor, in_parts
+from foveasim.learn._tensors import checked_gazes, in_parts
 from foveasim.learn.model import Model
 from foveasim.learn.readout import Readout
 from foveasim.scene import Scene
@@ -210,10 +210,8 @@ class SensorLayer(nn.Module):
         self._check(pictures)
         flat, shape, gaze = pictures.reshape(-1, *pictures.shape[-3:]), pictures.shape[:-3], None
         if gaze_um is not None:
-            is_path = isinstance(gaze_um, Tensor) and gaze_um.ndim == pictures.ndim - 1
-            expected = (*shape, None, 2) if is_path else (*shape, 2)
-            check_tensor("gaze_um", gaze_um, expected, ", one row (x, y) per picture, or a path", any_device=True)
-            shape, gaze = gaze_um.shape[:-1], gaze_um.reshape(flat.shape[0], *gaze_um.shape[len(shape) :])
+            gaze = checked_gazes(gaze_um, shape)
+            shape = gaze_um.shape[:-1]
         with _full_precision(pictures):
             # Parts of a batch are checked and decoded while they are in the cache.
             rates = in_parts(

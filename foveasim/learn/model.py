@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Annotated, Any, Literal
@@ -18,7 +17,7 @@ from foveasim.camera._footprints import placed
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator, UndistortedOutlines
-from foveasim.learn._tensors import Constants, SparseMap, check_tensor, constant, in_parts
+from foveasim.learn._tensors import Constants, SparseMap, check_tensor, checked_gazes, constant, in_parts
 from foveasim.learn.distortion import coefficient_names, coefficient_values, undistort, with_coefficients
 from foveasim.learn.imaging import VARIABLES as LENS_VARIABLES
 from foveasim.learn.imaging import Imaging, Origin, _check_variables, interleaved
@@ -248,7 +247,7 @@ class Model(nn.Module):
         def integrated(part: Tensor, shift: Tensor | None) -> Tensor:
             return self._integrated(self.imaging.outputs(part, transfer, shift, origin=origin, is_padded=is_padded))
 
-        found = in_parts(integrated, self.parts(flat, gaze_um), flat, shift)
+        found = in_parts(integrated, self.parts(flat, shift), flat, shift)
         shape = basis.shape[:-3] if gaze_um is None else gaze_um.shape[:-1]
         return self._collect(found.reshape(*shape, self.n_sites) * float(w_from_w_m2_um2(1.0)))
 
@@ -264,12 +263,11 @@ class Model(nn.Module):
         """
         return [matrix.tensor(like) for matrix in self._matrices]
 
-    def parts(self, scenes: Tensor, gaze_um: Tensor | None = None) -> list[slice]:
-        """Return the parts of a batch (n_scene, ...) that are computed at once."""
+    def parts(self, scenes: Tensor, gazes: Tensor | None = None) -> list[slice]:
+        """Return the parts of a batch that are computed at once; (n_scene, n_gaze, 2) gazes."""
         if not self._matrices:  # sites that move are compiled for all maps of the batch
             return [slice(None)]
-        n_gazes = 1 if gaze_um is None else math.prod(gaze_um.shape[:-1]) // max(1, scenes.shape[0])
-        return self.imaging.split(scenes, n_gazes)
+        return self.imaging.split(scenes, 1 if gazes is None else gazes.shape[1])
 
     def _integrated(self, maps: Iterable[Tensor]) -> Tensor:
         """Return the integrals (n_scene, n_site) of the maps of each filter over its sites."""
@@ -290,10 +288,7 @@ class Model(nn.Module):
 
     def _shift(self, basis: Tensor, gaze_um: Tensor) -> Tensor:
         """Return gazes in cells of the maps, (n_scene, n_gaze, 2)."""
-        scenes = tuple(basis.shape[:-3])
-        is_path = isinstance(gaze_um, Tensor) and gaze_um.ndim == len(scenes) + 2
-        expected = (*scenes, None, 2) if is_path else (*scenes, 2)
-        check_tensor("gaze_um", gaze_um, expected, ", one row (x, y) per picture or a path of them", any_device=True)
+        gazes_um = checked_gazes(gaze_um, basis.shape[:-3])
         if gaze_um.device != basis.device:
             raise ParameterError(
                 "gaze_um", f"must be on the device of the pictures, {basis.device}, got {gaze_um.device}"
@@ -316,8 +311,7 @@ class Model(nn.Module):
             )
         if self._footprints is not None:
             raise ParameterError("gaze_um", "must be that of the camera with pixel optics: create one layer per gaze")
-        n_gazes = gaze_um.shape[-2] if is_path else 1
-        return (gaze_um.to(basis) / self.grid_pitch_um(basis)).reshape(math.prod(scenes), n_gazes, 2)
+        return gazes_um.to(basis) / self.grid_pitch_um(basis)
 
     def grid_pitch_um(self, like: Tensor) -> Tensor:
         """Return the pitch of the maps along x and y, (2,) µm, as a tensor like another one."""
