@@ -75,7 +75,7 @@ bench: $(VENV)/.installed-dev
 # Training steps of layouts, against soft masks.
 bench-torch: $(TORCH_VENV)/.installed
 	$(TORCH_VENV)/bin/python benchmarks/gradients.py
-	OMP_PROC_BIND=true $(TORCH_VENV)/bin/python benchmarks/sensor_layers.py
+	$(TORCH_VENV)/bin/python benchmarks/sensor_layers.py
 
 # The same work with other libraries.
 peers: $(VENV)/.installed-dev

@@ -4,8 +4,7 @@ Cameras as layers of PyTorch, against their Fourier transforms and sparse produc
     python benchmarks/sensor_layers.py             everything (make bench-torch)
     python benchmarks/sensor_layers.py --quick     small batches, without bounds
 
-Runs on a GPU where PyTorch has one, and prints the rate at which the layer moves data relative to a copy in memory. On a CPU,
-pin the threads with OMP_PROC_BIND=true, as make does: threads that change cores leave their caches behind.
+Runs on a GPU where PyTorch has one, and prints the rate at which the layer moves data relative to a copy in memory.
 """
 
 from __future__ import annotations

@@ -826,3 +826,23 @@ def scatter(values, first_row, last_row, row_spans, row_weights, spans, weights,
             if first_row <= neighbour < last_row:
                 for i in range(row_cuts[row], row_cuts[row + 1]):
                     cells[neighbour, cuts[i, COLUMN]] += sign * moments[i, 1] * values[cuts[i, SITE]]
+
+
+@njit(
+    [
+        types.void(_input(types.int32, 1), _input(types.int32, 1), _input(real, 1), _input(real, 2), real[:, ::1])
+        for real in (types.float32, types.float64)
+    ]
+)
+def multiply_rows(row_begin, column, weights, cells, sums):
+    """
+    Write the products of a sparse matrix in CSR format with rows of cells.
+
+    ``cells`` is (n, n_column), ``sums`` (n, n_row).
+    """
+    for site in range(sums.shape[1]):
+        for k in range(sums.shape[0]):
+            total = weights.dtype.type(0.0)
+            for i in range(np.uintp(row_begin[site]), np.uintp(row_begin[site + 1])):
+                total += weights[i] * cells[k, np.uintp(column[i])]
+            sums[k, site] = total

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
+from threading import Lock
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
+from foveasim._core.threads import parallel_map, thread_count
 from foveasim.errors import ParameterError, type_name
+from foveasim.integrate._kernels import multiply_rows
 
 #: Number of times that a step is halved before it is cancelled.
 MAX_HALVINGS = 8
@@ -154,10 +159,20 @@ class SparseMap:
             self._tensors[key] = found
         return found
 
+    def _arrays(self, like: Tensor) -> tuple[NDArray[Any], ...]:
+        """Return the begin of each row, the columns and the elements of the matrix."""
+        get, matrix = partial(self._constants.get, like=like), self._matrix
+        begin = get("begin", compute=lambda: matrix.indptr.astype(np.int32))
+        column = get("columns", compute=lambda: matrix.indices.astype(np.int32))
+        return begin.numpy(), column.numpy(), get("elements", compute=lambda: matrix.data).numpy()
+
     def apply(self, values: Tensor) -> Tensor:
         """Return the products (..., m) of rows (..., n)."""
         rows = values.reshape(-1, self.shape[1])
-        if torch.compiler.is_compiling():  # in operations that other runtimes have
+        if is_array(rows) and self._matrix.nnz < 2**31:
+            found = rows.new_empty(rows.shape[0], self.shape[0])
+            multiply_rows(*self._arrays(rows), rows.contiguous().numpy(), found.numpy())
+        elif torch.compiler.is_compiling():  # in operations that other runtimes have
             get = partial(self._constants.get, like=rows)
             data = get("data", compute=lambda: self.entries.data)
             products = rows.index_select(1, get("column", compute=lambda: self.entries.col)) * data
@@ -190,22 +205,90 @@ class _Product(torch.autograd.Function):
         return _Product.apply(gradients[0], ctx.matrix, not ctx.is_transposed), None, None  # type: ignore[no-untyped-call]
 
 
-def in_parts(compute: Callable[..., Tensor], parts: Sequence[slice], *tensors: Tensor | None) -> Tensor:
-    """Return the results of a function for parts of the rows of tensors, one after the other."""
-    found: list[Tensor] = []
-    rows = None
-    for part in parts:
-        result = compute(*(None if each is None else each[part] for each in tensors))
-        if len(parts) == 1:
-            return result
-        if result.requires_grad:
-            found.append(result)
-            continue
-        if rows is None:
-            rows = result.new_empty(parts[-1].stop, *result.shape[1:])
-        rows[part] = result  # results that stay in memory between those of other parts would fragment it
-        del result
-    return torch.cat(found) if rows is None else rows
+def is_array(tensor: Tensor) -> bool:
+    """
+    Return whether a tensor is a mere array for kernels.
+
+    In memory, and without derivatives and transforms.
+    """
+    if type(tensor) is not Tensor or tensor.device.type != "cpu" or tensor.dtype not in (torch.float32, torch.float64):
+        return False
+    is_tracked = (tensor.requires_grad and torch.is_grad_enabled()) or unpack_dual(tensor).tangent is not None
+    if is_tracked or torch.compiler.is_compiling():
+        return False
+    try:
+        tensor.new_empty(0).numpy()
+    except RuntimeError:  # within a transform of torch.func
+        return False
+    return True
+
+
+def in_parts(
+    compute: Callable[..., Tensor],
+    parts: Sequence[slice],
+    *tensors: Tensor | None,
+    finish: Callable[[Tensor], Tensor] = lambda result: result,
+) -> Tensor:
+    """
+    Return the results of a function for parts of the rows of tensors.
+
+    Without derivatives, each core of the CPU computes parts of its own: cores that work on one operation together exchange data
+    through a common cache, or memory. Results are bit-identical for any number of threads.
+
+    Parameters
+    ----------
+    compute : callable
+        Of a part of each tensor.
+    parts : sequence of slice
+    *tensors : tensor or None
+    finish : callable
+        Of the result of each part, in the order of the parts, as random numbers require.
+    """
+
+    def result_of(part: slice) -> Tensor:
+        return compute(*(None if each is None else each[part] for each in tensors))
+
+    first = finish(result_of(parts[0]))  # creates the constants
+    if len(parts) == 1:
+        return first
+    if first.requires_grad:
+        return torch.cat([first, *(finish(result_of(part)) for part in parts[1:])])
+    # Results that stay in memory between those of other parts would fragment it.
+    rows = first.new_empty(parts[-1].stop, *first.shape[1:])
+    rows[parts[0]] = first
+    del first
+    n_threads = _count_threads(len(parts) - 1) if is_array(rows) else 1
+    n_own, is_inference = torch.get_num_threads(), torch.is_inference_mode_enabled()
+    results: dict[int, Tensor] = {}
+    waiting, lock = deque(parts[1:]), Lock()
+
+    def compute_alone(part: slice) -> None:
+        torch.set_num_threads(1)
+        try:
+            with torch.inference_mode(is_inference), torch.no_grad():
+                result = result_of(part)
+                with lock:
+                    results[part.start] = result
+                    while waiting and waiting[0].start in results:
+                        ready = waiting.popleft()
+                        rows[ready] = finish(results.pop(ready.start))
+        finally:
+            torch.set_num_threads(n_own)
+
+    if n_threads > 1:
+        parallel_map(compute_alone, parts[1:], n_threads)
+    else:
+        for part in parts[1:]:
+            rows[part] = finish(result_of(part))
+    return rows
+
+
+def _count_threads(n_parts: int) -> int:
+    """Return the number of threads that compute parts, or 1 where all work on each part."""
+    if torch.is_autocast_enabled("cpu"):  # which other threads do not know
+        return 1
+    n_threads = min(torch.get_num_threads(), thread_count())
+    return n_threads if 2 * n_parts > n_threads else 1
 
 
 def constant(values: Any) -> Tensor:

@@ -24,10 +24,11 @@ from foveasim._core.validation import Floats, Ints
 from foveasim._io.mapped_files import in_memory
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, SceneLike
-from foveasim.learn._tensors import Constants, check_tensor, constant, in_parts
+from foveasim.learn._tensors import Constants, check_tensor, constant, in_parts, is_array
 from foveasim.optics import Optics, PupilImage, Seidel, Zernike, zernike
 from foveasim.optics._aperture import PUPIL_POINTS, Aperture, overlaps
 from foveasim.optics._imaging import PatchExtent
+from foveasim.optics._kernels import pad_pictures
 from foveasim.units import um_from_nm
 
 __all__ = ["VARIABLES", "Imaging", "Origin"]
@@ -41,7 +42,7 @@ VARIABLES = ("zernike", "seidel", "defocus", "pupil")
 PATCHES = 5
 #: Number of cells, of all padded basis images, that a processor transforms at once: they stay in its cache.
 MAX_PART = 2**21
-#: Largest number of runs of pixels that padding copies; others are looked up.
+#: Largest number of runs of pixels that are copied with derivatives; others are looked up.
 MAX_RUNS = 8
 #: Coefficients of Seidel aberrations, in the order of the tensor.
 SEIDEL_NAMES = ("spherical_um", "coma_um", "astigmatism_um", "field_curvature_um")
@@ -579,52 +580,55 @@ class _Padding:
     """Padded part of pictures: repeated pixels, times the falloff."""
 
     def __init__(self, rows: PatchExtent, columns: PatchExtent, window: Floats, n_y: int) -> None:
-        self._columns = _Runs(columns.sources)
+        self._runs = _runs(columns.sources)
         self._is_even = bool(np.all(window == 1.0))
         self._is_whole = np.array_equal(rows.sources, np.arange(n_y))
-        self._constants = Constants(window=window, lower=rows.sources, upper=n_y - 1 - rows.sources)
+        self._constants = Constants(
+            window=window, lower=rows.sources, upper=n_y - 1 - rows.sources, columns=columns.sources
+        )
         extents = columns, rows
         self._zeros = [n for each in extents for n in (each.pixels.start, each.cells.size - each.pixels.stop)]
 
     def apply(self, pictures: Tensor, origin: Origin) -> Tensor:
         """Return the padded part of pictures (..., n_y, n_x), bottom row first."""
-        found, is_copy = self._columns.take(pictures), origin == "upper" or not self._is_whole
-        if is_copy:
-            found = found.index_select(-2, self._constants.get(origin, pictures))
-        if not self._is_even:
-            window = self._constants.get("window", pictures)
-            found = found.mul_(window) if is_copy else found * window
+        window, rows, columns = (self._constants.get(name, pictures) for name in ("window", origin, "columns"))
+        if is_array(pictures):
+            found = pictures.new_empty(*pictures.shape[:-2], *window.shape)
+            flat = pictures.reshape(-1, *pictures.shape[-2:]).contiguous()
+            padded = found.view(-1, *window.shape).numpy()
+            pad_pictures(flat.numpy(), rows.numpy(), self._runs, window.numpy(), padded)
+        else:
+            if origin == "upper" or not self._is_whole:
+                pictures = pictures.index_select(-2, rows)
+            if len(self._runs) <= MAX_RUNS:
+                found = torch.cat([_run(pictures, *each) for each in self._runs.tolist()], dim=-1)
+            else:
+                found = pictures.index_select(-1, columns)
+            found = found if self._is_even else found * window
         return nn.functional.pad(found, self._zeros) if any(self._zeros) else found
 
 
-class _Runs:
-    """Sources of the pixels along x, as runs with steps of 1, -1 or 0."""
+def _runs(sources: Ints) -> Ints:
+    """Return the first pixel, the length and the step (1, -1 or 0) of runs of pixels, (n, 3)."""
+    runs: list[tuple[int, int, int]] = []
+    k = 0
+    while k < sources.size:
+        step = int(sources[k + 1] - sources[k]) if k + 1 < sources.size else 1
+        step = step if abs(step) <= 1 else 1
+        n = 1
+        while k + n < sources.size and sources[k + n] - sources[k + n - 1] == step:
+            n += 1
+        runs.append((int(sources[k]), n, step))
+        k += n
+    return np.array(runs, np.int64).reshape(-1, 3)
 
-    def __init__(self, sources: Ints) -> None:
-        self._runs: list[tuple[int, int, int]] = []
-        k = 0
-        while k < sources.size and len(self._runs) <= MAX_RUNS:
-            step = int(sources[k + 1] - sources[k]) if k + 1 < sources.size else 1
-            step = step if abs(step) <= 1 else 1
-            n = 1
-            while k + n < sources.size and sources[k + n] - sources[k + n - 1] == step:
-                n += 1
-            self._runs.append((int(sources[k]), n, step))
-            k += n
-        self._constants = Constants(sources=sources)
 
-    def take(self, values: Tensor) -> Tensor:
-        """Return the elements along the last axis."""
-        if len(self._runs) > MAX_RUNS:
-            return values.index_select(-1, self._constants.get("sources", values))
-        parts = []
-        for first, n, step in self._runs:
-            if step == 0:
-                parts.append(values.narrow(-1, first, 1).expand(*values.shape[:-1], n))
-            else:
-                run = values.narrow(-1, first if step > 0 else first - n + 1, n)
-                parts.append(run if step > 0 else run.flip(-1))
-        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
+def _run(values: Tensor, first: int, n: int, step: int) -> Tensor:
+    """Return a run of elements along the last axis."""
+    if step == 0:
+        return values.narrow(-1, first, 1).expand(*values.shape[:-1], n)
+    run = values.narrow(-1, first if step > 0 else first - n + 1, n)
+    return run if step > 0 else run.flip(-1)
 
 
 def interleaved(transfer: Tensor) -> Tensor:

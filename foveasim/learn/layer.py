@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -207,18 +207,22 @@ class SensorLayer(nn.Module):
         -------
         (..., n_site) or (..., n_gaze, n_site) tensor, e-/s
         """
+        return self._finished(pictures, gaze_um, lambda rates: rates)
+
+    def _finished(self, pictures: Tensor, gaze_um: Tensor | None, finish: Callable[[Tensor], Tensor]) -> Tensor:
+        """Return a function of the photoelectrons per second, for each part of a batch."""
         self._check(pictures)
         flat, shape, gaze = pictures.reshape(-1, *pictures.shape[-3:]), pictures.shape[:-3], None
         if gaze_um is not None:
             gaze = checked_gazes(gaze_um, shape)
             shape = gaze_um.shape[:-1]
         with _full_precision(pictures):
-            # Parts of a batch are checked and decoded while they are in the cache.
-            rates = in_parts(
+            # Parts are checked, decoded and read while they are in the cache.
+            found = in_parts(
                 lambda part, gaze: self.model.photo_e_per_s(self._basis(part), gaze, origin="upper"),
-                self.model.parts(flat, gaze), flat, gaze,
+                self.model.parts(flat, gaze), flat, gaze, finish=finish,
             )  # fmt: skip
-            return rates.reshape(*shape, self.n_sites)
+            return found.reshape(*shape, self.n_sites)
 
     def light_e(self, pictures: Tensor, *, with_dark: bool = False) -> Tensor:
         """
@@ -251,9 +255,10 @@ class SensorLayer(nn.Module):
         pictures, gaze_um
             As for :meth:`forward`.
         """
-        rates = self.photo_e_per_s(pictures, gaze_um).clamp_min(0.0)
-        with _full_precision(rates):
-            return self.readout.expected_e(rates, self.model.exposure_s.to(rates.dtype))
+        return self._finished(pictures, gaze_um, self._expected_e)
+
+    def _expected_e(self, rates: Tensor) -> Tensor:
+        return self.readout.expected_e(rates.clamp_min(0.0), self.model.exposure_s.to(rates.dtype))
 
     def forward(
         self, pictures: Tensor, gaze_um: Tensor | None = None, *, generator: torch.Generator | None = None
@@ -275,12 +280,14 @@ class SensorLayer(nn.Module):
         (..., n_site) or (..., n_gaze, n_site) tensor
             Codes, DN, or charges, e-: see ``output``.
         """
-        expected_e = self.expected_e(pictures, gaze_um)
-        if self.output == "expected":
-            return expected_e
-        with _full_precision(expected_e):
-            charge_e = self.readout.draw(expected_e, generator) if self.noise else expected_e
+
+        def read(rates: Tensor) -> Tensor:
+            charge_e = self._expected_e(rates)
+            if self.noise:
+                charge_e = self.readout.draw(charge_e, generator)
             return charge_e if self.output == "charge" else self.readout.code(charge_e)
+
+        return self._finished(pictures, gaze_um, self._expected_e if self.output == "expected" else read)
 
 
 def _template(shape: Any) -> Scene:

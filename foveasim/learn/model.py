@@ -146,8 +146,9 @@ class Model(nn.Module):
         self._used = sensor.filters_used.tolist()
         self._constants = Constants(
             photons_per_j=1.0 / photon_energy_j(wave_nm),
-            **{f"sites {c}": np.flatnonzero(sensor.filter_of_site == c) for c in self._used},
-        )  # fmt: skip
+            # Of each site among those of the first filter, then the second, ...
+            position_of_site=np.argsort(np.argsort(sensor.filter_of_site, kind="stable")),
+        )
         if self._footprints is not None:
             self._constants.add(factor=self._footprints.factor, area_ratio=self._footprints.area_ratio)
         mixing = None if self._footprints is None else self._footprints.mixing
@@ -245,7 +246,8 @@ class Model(nn.Module):
         is_padded = bool(self._matrices) and not self.imaging.has_patches
 
         def integrated(part: Tensor, shift: Tensor | None) -> Tensor:
-            return self._integrated(self.imaging.outputs(part, transfer, shift, origin=origin, is_padded=is_padded))
+            maps = self.imaging.outputs(part, transfer, shift, origin=origin, is_padded=is_padded)
+            return self._integrated(maps).reshape(-1, 1 if shift is None else shift.shape[1], self.n_sites)
 
         found = in_parts(integrated, self.parts(flat, shift), flat, shift)
         shape = basis.shape[:-3] if gaze_um is None else gaze_um.shape[:-1]
@@ -272,19 +274,16 @@ class Model(nn.Module):
     def _integrated(self, maps: Iterable[Tensor]) -> Tensor:
         """Return the integrals (n_scene, n_site) of the maps of each filter over its sites."""
         points = None if self._moving is None or self._matrices else self.points()
-        rates = None
+        powers = []
         for k, of_filter in enumerate(maps):
             if points is None:
-                power = self._matrices[k].apply(of_filter.flatten(-2))
+                powers.append(self._matrices[k].apply(of_filter.flatten(-2)))
             else:
                 assert self._moving is not None
-                power = site_power(points, of_filter, self._moving.outlines_of[k], self.grid, order=self.order)
-            if len(self._used) == 1:
-                return power
-            rates = power.new_zeros(power.shape[0], self.n_sites) if rates is None else rates
-            rates = rates.index_copy(-1, self._constants.get(f"sites {self._used[k]}", power), power)
-        assert rates is not None
-        return rates
+                powers.append(site_power(points, of_filter, self._moving.outlines_of[k], self.grid, order=self.order))
+        if len(powers) == 1:
+            return powers[0]
+        return torch.cat(powers, dim=-1).index_select(-1, self._constants.get("position_of_site", powers[0]))
 
     def _shift(self, basis: Tensor, gaze_um: Tensor) -> Tensor:
         """Return gazes in cells of the maps, (n_scene, n_gaze, 2)."""

@@ -138,6 +138,39 @@ def pad_lines(source_row, n_before, n_rows, lines):
             line[row] = line[n_before + source_row[row]] if source_row[row] >= 0 else 0.0
 
 
+@njit(
+    [
+        types.void(_in(real, 3), _in(types.int64, 1), _in(types.int64, 2), _in(real, 2), real[:, :, ::1])
+        for real in (types.float32, types.float64)
+    ]
+)
+def pad_pictures(pictures, source_row, runs, window, out):
+    """
+    Write padded pictures (n, n_row, n_column), times a window (n_row, n_column).
+
+    ``source_row`` contains the picture row of each row. ``runs`` are the columns: the first picture column, the number and the
+    step, 1, -1 or 0, of each run.
+    """
+    for picture in range(out.shape[0]):
+        for row in range(out.shape[1]):
+            source, line, begin = pictures[picture, source_row[row]], out[picture, row], 0
+            for run in range(runs.shape[0]):
+                first, n, step = runs[run]
+                target, weight = line[begin : begin + n], window[row, begin : begin + n]
+                if step == 1:
+                    values = source[first : first + n]
+                    for k in range(n):
+                        target[k] = values[k] * weight[k]
+                elif step == -1:
+                    values, last = source[first - n + 1 : first + 1], np.uint64(n - 1)
+                    for k in range(n):  # unsigned indices: none is counted from the end
+                        target[k] = values[last - np.uint64(k)] * weight[k]
+                else:
+                    for k in range(n):
+                        target[k] = source[first] * weight[k]
+                begin += n
+
+
 @njit([types.void(_in(c, 2), types.int64, _in(c, 1), _in(c, 1), types.int64, c[:, ::1]) for c, _ in _PAIRS])
 def replicate(lines, n_columns, phase_x, phase_y, first, out):
     """

@@ -332,6 +332,77 @@ def test_layer_is_a_module():
     assert all(torch.equal(each, first) for each in found)
 
 
+@pytest.fixture
+def one_picture_per_part(monkeypatch):
+    """Let batches be computed in parts of one picture, on three threads of which each has a part."""
+    n_threads = torch.get_num_threads()
+    monkeypatch.setattr("foveasim.learn.imaging.MAX_PART", 1)
+    monkeypatch.setattr("foveasim.learn._tensors.thread_count", lambda: 3)
+    torch.set_num_threads(4)
+    yield
+    assert torch.get_num_threads() == 4
+    torch.set_num_threads(n_threads)
+
+
+@pytest.mark.usefixtures("one_picture_per_part")
+@pytest.mark.parametrize("name", ["mixing", "patches", "moved"])
+@pytest.mark.parametrize("context", [torch.no_grad, torch.inference_mode, torch.enable_grad])
+def test_parts_of_batches_are_independent(name, context):
+    layer = learn.SensorLayer(camera(**CAMERAS[name]), scene(), exposure_s=EXPOSURE_S)
+    pictures = torch.rand(7, 3, *SHAPE)
+    with context():
+        found = layer(pictures, generator=torch.Generator().manual_seed(4))
+        whole = torch.stack([layer.photo_e_per_s(picture) for picture in pictures])
+
+        assert torch.equal(layer.photo_e_per_s(pictures), whole)
+        assert torch.equal(layer(pictures, generator=torch.Generator().manual_seed(4)), found)
+        assert found.is_inference() == (context is torch.inference_mode)
+
+
+@pytest.mark.usefixtures("one_picture_per_part")
+def test_parts_of_batches_follow_their_gazes():
+    layer = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S)
+    pictures, path = torch.rand(7, 3, *SHAPE, dtype=torch.float64), torch.rand(7, 2, 2, dtype=torch.float64)
+    whole = torch.stack([layer.photo_e_per_s(*each) for each in zip(pictures, path, strict=True)])
+
+    assert torch.equal(layer.photo_e_per_s(pictures, path), whole)
+    assert torch.equal(layer.model.photo_e_per_s(pictures, path, origin="upper"), whole)
+
+
+@pytest.mark.usefixtures("one_picture_per_part")
+def test_parts_of_batches_have_gradients():
+    layer = learn.SensorLayer(camera(), scene(), ("filters",), exposure_s=EXPOSURE_S)
+    pictures = torch.rand(5, 3, *SHAPE, dtype=torch.float64)
+    layer.photo_e_per_s(pictures).square().sum().backward()
+    found, layer.model.filters.grad = layer.model.filters.grad, None
+    for picture in pictures:
+        layer.photo_e_per_s(picture).square().sum().backward()
+
+    torch.testing.assert_close(found, layer.model.filters.grad, rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.usefixtures("one_picture_per_part")
+def test_errors_of_parts_are_raised():
+    layer = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S)
+    pictures = torch.rand(7, 3, *SHAPE)
+    pictures[5, 0, 3, 3] = float("nan")
+
+    with pytest.raises(fs.errors.ParameterError, match="must be finite"):
+        layer(pictures)
+
+
+@pytest.mark.usefixtures("one_picture_per_part")
+def test_layers_work_within_functional_gradients():
+    layer = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S, output="expected")
+    pictures = torch.rand(4, 3, *SHAPE, dtype=torch.float64)
+    variable = pictures.clone().requires_grad_()
+    layer(variable).square().sum().backward()
+
+    torch.testing.assert_close(torch.func.grad(lambda each: layer(each).square().sum())(pictures), variable.grad)
+    gain = torch.func.grad(lambda gain: gain * layer(pictures).sum())(torch.ones(()))
+    assert float(gain) == pytest.approx(float(layer(pictures).sum()))
+
+
 def test_layer_can_be_used_first_without_gradients():
     """Constants that are created in inference mode must not stay inference tensors."""
     layer = learn.SensorLayer(camera(**CAMERAS["mixing"]), scene(), ("filters",), exposure_s=EXPOSURE_S)
