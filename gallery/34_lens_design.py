@@ -1,7 +1,8 @@
 """
 What does a sensor see through a real lens design, and how many modes do its PSFs need?
 
-New here: ``fs.optics.PSFGrid.from_arrays``, ``Optics(psfs=...)``, ``Optics(field_modes=...)``, ``Optics.field_error``.
+New here: ``fs.optics.PSFGrid.from_arrays``, ``Optics(psfs=...)``, ``Optics(field_modes=...)``, ``Optics.field_error``,
+``Optics.psf_modes``.
 
 Expect: a Cooke triplet at f/5 that images a star sharply on the axis, and with coma and astigmatism at 8 and 15 mm. The
 singular values of its PSFs decrease by a factor of 100 within 10 modes. With 6 modes, some 2 % of the light of a point is
@@ -186,7 +187,7 @@ def main(out_dir: Path) -> None:
         each.set_xticks([])
         each.set_yticks([])
     left, right = rows[1].subplots(1, 2)
-    values = lens._field_modes(wide, 1).singular_values[:40]  # noqa: SLF001 -- only for this figure
+    values = lens.psf_modes(wide).singular_values[:40]
     left.semilogy(np.arange(1, values.size + 1), values / values[0], "o-", markersize=3)
     left.set_xlabel("mode")
     left.set_ylabel("relative singular value")
@@ -223,7 +224,7 @@ def main(out_dir: Path) -> None:
     print(f"Strehl ratios: {', '.join(f'{value:.2f}' for value in strehl)}")
     for k in N_MODES:
         print(f"{k:2d} modes: {displaced[k]:.1%} of the light displaced, {times_s[k]:.1f} times the frame")
-    chosen = lens._field_modes(wide, 1)  # noqa: SLF001
+    chosen = lens.psf_modes(wide)
     print(f"tolerance of 3 %: {chosen.n_modes - 1} modes")
 
 

@@ -2,8 +2,8 @@
 Optics as a differentiable function of scene, spectral weights and aberrations.
 
 Maps are those of :meth:`foveasim.Optics.weighted_maps`, on the device and with the precision of the pictures. The transforms
-are those of torch, so that derivatives of any order exist; only the transfer functions of a lens without variables come from
-the kernels of the simulator.
+are those of torch, so that derivatives of any order exist; only the transfer functions of a lens without variables, and the
+padding of pictures without derivatives, come from the kernels of the simulator.
 """
 
 from __future__ import annotations

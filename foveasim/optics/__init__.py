@@ -5,6 +5,7 @@ from __future__ import annotations
 from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
 from foveasim.incidence import ChiefRayTable, Incidence
+from foveasim.optics._field_modes import FieldModes
 from foveasim.optics._illumination import IlluminationTable
 from foveasim.optics._optics import Optics
 from foveasim.optics._point_images import PointSpread
@@ -21,6 +22,7 @@ __all__ = [
     "Annulus",
     "Blades",
     "ChiefRayTable",
+    "FieldModes",
     "IlluminationTable",
     "Incidence",
     "LateralColour",

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import parallel_map
 from foveasim._core.validation import Floats
 from foveasim.fields import Grid
@@ -75,10 +76,18 @@ class FieldModes:
     """
     Modes of the PSFs at the points of a field.
 
-    ``points_um`` (n_point, 2): x and y of the points, row by row. ``combinations`` (n_mode, n_point): each mode as a sum of the
-    PSFs at the points; that of the mean first, all others with the sum 0. ``at_points`` (n_mode, n, n): weights at the points.
-    ``singular_values`` (n_point - 1,): those of the deviations from the mean PSF, sampled at λN/2, over the root of the number
-    of wavelengths. ``displaced``: largest fraction of the light that the modes displace at the points and between them.
+    Attributes
+    ----------
+    points_um : (n_point, 2) float64, µm
+        x and y of the points, row by row from the bottom.
+    combinations : (n_mode, n_point) float64
+        Each mode as a sum of the PSFs at the points: that of the mean first, all others with the sum 0.
+    at_points : (n_mode, n, n) float64
+        Weights of the modes at the points.
+    singular_values : (n_point - 1,) float64
+        Those of the deviations from the mean PSF, sampled at λN/2, over the root of the number of wavelengths; descending.
+    displaced : float
+        Largest fraction of the light of a point that the modes displace, at the points and between them.
     """
 
     points_um: Floats
@@ -86,6 +95,8 @@ class FieldModes:
     at_points: Floats
     singular_values: Floats
     displaced: float
+
+    __repr__ = short_repr
 
     @property
     def n_modes(self) -> int:

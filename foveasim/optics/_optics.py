@@ -766,6 +766,32 @@ class Optics(PointImages):
             for wave_nm, near_um in zip(scene.wavelength_nm, self._lambda_n_um(scene), strict=True)
         )
 
+    def psf_modes(self, scene: SceneLike) -> FieldModes:
+        """
+        Return the modes of PSFs that vary over the field.
+
+        Parameters
+        ----------
+        scene : Scene
+
+        Returns
+        -------
+        FieldModes
+            Their number, weights, singular values, and the light that they displace.
+
+        Raises
+        ------
+        ParameterError
+            When the PSF is constant, or isoplanatic patches replace modes.
+        """
+        if not self._has_modes():
+            raise ParameterError(
+                "optics",
+                "must have a PSF that varies over the field, and no 'field_patches', for modes",
+                self,
+            )
+        return self._field_modes(scene, thread_count(None))
+
     def _has_modes(self) -> bool:
         return self.is_varying and self.field_patches is None
 

@@ -211,6 +211,22 @@ def test_more_points_reach_the_tolerance():
     assert modes.displaced <= 0.01
 
 
+def test_modes_are_those_of_maps():
+    modes = LENS.psf_modes(noise())
+
+    assert modes.displaced == LENS.field_error(noise())
+    assert modes.n_modes == len(modes.at_points)
+    assert np.all(np.diff(modes.singular_values) <= 0.0)
+    np.testing.assert_allclose(modes.combinations.sum(axis=1), [1.0] + [0.0] * (modes.n_modes - 1), atol=1e-9)
+    assert replace(LENS, field_modes=3).psf_modes(noise()).n_modes == 4
+
+
+@pytest.mark.parametrize("changes", [{"field_patches": 3}, {"seidel": None}])
+def test_lenses_without_modes_are_rejected(changes):
+    with pytest.raises(ParameterError, match="must have a PSF that varies"):
+        replace(LENS, **changes).psf_modes(noise())
+
+
 def test_equal_psfs_need_no_modes():
     nearly = replace(LENS, seidel=Seidel(spherical_um=0.1, coma_um=1.0, field_radius_um=1e7))
     scene = noise()

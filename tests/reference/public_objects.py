@@ -31,6 +31,9 @@ MANY = np.linspace(0.0, 1.0, 1000)
 TABLE = tuple(np.linspace(400.0, 700.0, 200))
 SITES = fs.layout.grid(40, 30, 2.0)
 OPTICS = fs.Optics(focal_length_mm=8.0, f_number=2.8)
+OPTICS_OVER_FIELD = fs.Optics(
+    focal_length_mm=8.0, f_number=8.0, seidel=optics.Seidel(coma_um=0.5, field_radius_um=500.0), field_modes=2
+)
 PSFS = optics.PSFGrid(
     psf=np.pad(np.ones((3, 1, 1, 1)), ((0, 0), (0, 0), (9, 9), (9, 9))),
     x_um=np.arange(3.0),
@@ -98,6 +101,7 @@ def public_objects(directory):
         REPORT.results[0], SITES.describe(layout.Readout(frames_per_s=30.0, bits=8)), REPORT.violations[0],
         SITES.write(directory / "sites.geojson"), BarElement(group=0, element=1, direction="vertical", line_pairs_per_mm=1.0, x_mm=0.0, y_mm=0.0, side_mm=1.0),
         optics.Annulus(0.3), optics.Blades(5), optics.LateralColour(wavelength_nm=TABLE, magnification=(1.0,) * 200),
+        OPTICS_OVER_FIELD.psf_modes(SCENE),
         optics.PointSpread(psf_per_um2=np.ones(GRID.shape), grid=GRID, wavelength_nm=550.0),
         optics.ChiefRayTable(image_height_um=np.arange(200.0), angle_deg=0.1 * np.arange(200.0)), OPTICS.incidence(SITES.centroid_um),
         optics.IlluminationTable(image_height_um=np.arange(200.0), fraction=np.linspace(1.0, 0.5, 200)), PSFS,
