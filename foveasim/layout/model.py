@@ -291,9 +291,9 @@ class Layout:
 
         Parameters
         ----------
-        polygons : sequence of shapely Polygon, or the tuple (xy_um, ring_offsets, site_offsets)
+        polygons : sequence of shapely Polygon or (n, 2) vertices, or the tuple (xy_um, ring_offsets, site_offsets)
             Coordinates in µm. Packed rings are as for the class, but may have any winding order and may repeat the first
-            vertex at the end.
+            vertex at the end, as vertices of a polygon may.
         channel, readout_line, **columns : (n_site,) arrays, optional
             Data per site.
         provenance : mapping, optional
@@ -311,8 +311,10 @@ class Layout:
         >>> layout = Layout.from_polygons([shapely.box(0, 0, 2, 2), shapely.Point(5, 0).buffer(1)], channel=[0, 1])
         >>> layout.n_sites, float(layout.area_um2[0])
         (2, 4.0)
+        >>> Layout.from_polygons([[(0, 0), (2, 0), (0, 2)], [(2, 2), (4, 0), (4, 2)]]).n_sites
+        2
         """
-        if isinstance(polygons, tuple) and len(polygons) == 3 and not isinstance(polygons[0], shapely.Geometry):
+        if _is_packed(polygons):
             xy_um, ring_offsets, site_offsets = _check_packed(*polygons)
         else:
             xy_um, ring_offsets, site_offsets = _pack_polygons(polygons)
@@ -711,27 +713,55 @@ def _check_packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: Array
     return xy, rings, _offsets("site_offsets", site_offsets, 1, rings.size - 1, "rings")
 
 
+def _is_packed(polygons: Any) -> bool:
+    """Return whether polygons are packed rings: vertices, and two sequences of offsets."""
+    if not (isinstance(polygons, tuple) and len(polygons) == 3):
+        return False
+    offsets = polygons[1]
+    return not isinstance(offsets, shapely.Geometry) and not (_is_vertices(offsets) and len(offsets) > 2)
+
+
+def _is_vertices(outline: Any) -> bool:
+    """Return whether an outline is an array (n, 2) of numbers."""
+    if isinstance(outline, shapely.Geometry) or not isinstance(outline, Sequence | np.ndarray):
+        return False
+    try:
+        found = np.asarray(outline)
+    except ValueError:  # rows of different lengths
+        return False
+    return found.ndim == 2 and found.shape[1] == 2 and found.dtype.kind in "iuf"
+
+
 def _pack_polygons(polygons: Any) -> tuple[Floats, Ints, Ints]:
-    """Return packed rings of shapely polygons, closing vertices included."""
+    """Return packed rings of shapely polygons or vertices, closing vertices included."""
     items = polygons.geoms if hasattr(polygons, "geoms") else polygons
     if (
         isinstance(items, str | bytes | shapely.Geometry)
         or not isinstance(items, Iterable)
         or (isinstance(items, np.ndarray) and not items.ndim)
     ):
-        raise ParameterError("polygons", "must be a sequence of shapely polygons, or packed rings", items)
-    geometries = np.fromiter(items, dtype=object)
-    is_polygon = np.array([isinstance(g, shapely.Polygon) for g in geometries], bool)
-    if not is_polygon.all():
-        bad = int(np.flatnonzero(~is_polygon)[0])
-        is_geometry = isinstance(geometries[bad], shapely.Geometry)
-        hint = (
-            "pass each of its parts as a separate site" if is_geometry else "create one with shapely.Polygon(vertices)"
-        )
-        raise GeometryError(
-            f"site {bad} must be a shapely Polygon, got {type_name(geometries[bad])}; {hint}",
-            (bad,),
-        )
+        raise ParameterError("polygons", "must be a sequence of shapely polygons or vertices, or packed rings", items)
+    outlines = list(items)
+    is_polygon = np.array([isinstance(each, shapely.Polygon) for each in outlines], bool)
+    for number in np.flatnonzero(~is_polygon).tolist():
+        outline = outlines[number]
+        if not _is_vertices(outline):
+            is_geometry = isinstance(outline, shapely.Geometry)
+            hint = "; pass each of its parts as a separate site" if is_geometry else ""
+            raise GeometryError(
+                f"site {number} must be a shapely Polygon, or vertices (n, 2), got {type_name(outline)}{hint}",
+                (number,),
+            )
+        outlines[number] = np.asarray(outline, np.float64)
+    if outlines and not is_polygon.any():
+        n_vertices = np.array([len(each) for each in outlines])
+        _require(n_vertices == 0, "is empty")
+        return np.concatenate(outlines), np.r_[0, np.cumsum(n_vertices)], np.arange(len(outlines) + 1)
+    is_short = np.array([isinstance(each, np.ndarray) and len(each) < 3 for each in outlines], bool)
+    _require(is_short, "has a ring of fewer than 3 distinct vertices")
+    geometries = np.fromiter(
+        (shapely.Polygon(each) if isinstance(each, np.ndarray) else each for each in outlines), dtype=object
+    )
     _require(shapely.is_empty(geometries), "is empty")
     if geometries.size == 0:
         return np.zeros((0, 2)), np.zeros(1, np.int64), np.zeros(1, np.int64)

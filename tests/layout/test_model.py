@@ -252,11 +252,19 @@ BAD_SITES = {
     "two points": (shapely.Polygon([(0, 0), (1, 1), (0, 0)]), "site 1 has a ring of fewer than 3 distinct"),
     "several parts": (
         shapely.MultiPolygon([UNIT, shapely.box(3, 3, 4, 4)]),
-        "site 1 must be a shapely Polygon, got a Mul",
+        "site 1 must be a shapely Polygon, or vertices .n, 2., got a Mul",
     ),
-    "line": (shapely.LineString([(0, 0), (1, 1)]), "site 1 must be a shapely Polygon, got a LineString"),
-    "nothing": (None, "site 1 must be a shapely Polygon, got a NoneType"),
-    "coordinates": ([(0, 0), (1, 0), (1, 1)], "site 1 must be a shapely Polygon, got a list"),
+    "line": (
+        shapely.LineString([(0, 0), (1, 1)]),
+        "site 1 must be a shapely Polygon, or vertices .*, got a LineString",
+    ),
+    "nothing": (None, "site 1 must be a shapely Polygon, or vertices .*, got a NoneType"),
+    "text": ("POLYGON", "site 1 must be a shapely Polygon, or vertices .*, got a str"),
+    "points in space": (np.zeros((4, 3)), "site 1 must be a shapely Polygon, or vertices .*, got an ndarray"),
+    "rows of different lengths": ([(0, 0), (1, 0, 0), (1, 1)], "site 1 must be .*, or vertices .*, got a list"),
+    "names": ([("a", "b"), ("c", "d"), ("e", "f")], "site 1 must be .*, or vertices .*, got a list"),
+    "two vertices": ([(0, 0), (1, 1)], "site 1 has a ring of fewer than 3 distinct"),
+    "flat vertices": ([(0, 0), (1, 1), (2, 2)], "site 1 has a ring with zero area"),
     "hole outside": (
         shapely.Polygon(shapely.box(0, 0, 1, 1).exterior, [shapely.box(2, 2, 3, 3).exterior]),
         "site 1 has a hole outside its outline",
@@ -282,6 +290,34 @@ def test_invalid_polygon_raises_with_index(bad, message):
 
     assert caught.value.site_ids == (1,)
     assert "\n" not in str(caught.value)
+
+
+OUTLINES = [[(0, 0), (2, 0), (2, 2)], [(3, 0), (3, 2), (5, 2), (5, 0), (3, 0)], [(6, 0), (8, 0), (7, 2)]]
+
+
+@pytest.mark.parametrize("kind", [list, tuple, iter])
+@pytest.mark.parametrize("convert", [list, np.array, lambda each: np.array(each, np.float32), shapely.Polygon])
+def test_vertices_are_accepted_as_polygons(kind, convert):
+    expected = Layout.from_polygons([shapely.Polygon(each) for each in OUTLINES])
+    found = Layout.from_polygons(kind([convert(each) for each in OUTLINES]))
+    mixed = Layout.from_polygons([shapely.Polygon(OUTLINES[0]), *map(convert, OUTLINES[1:])])
+
+    for layout in (found, mixed):
+        assert layout.n_sites == 3
+        assert layout.area_um2.tolist() == [2.0, 4.0, 2.0]
+        assert all(a.equals(b) for a, b in zip(layout.polygons(), expected.polygons(), strict=True))
+
+
+def test_array_of_equal_outlines_is_accepted():
+    corners = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) + 2.0 * np.arange(5)[:, None, None]
+
+    assert Layout.from_polygons(corners).area_um2.tolist() == [1.0] * 5
+
+
+def test_packed_rings_are_not_taken_for_outlines():
+    layout = Layout.from_polygons(([(0, 0), (2, 0), (2, 2)], [0, 3], [0, 1]))
+
+    assert layout.n_sites == 1
 
 
 BAD_RINGS = {
