@@ -108,7 +108,7 @@ interface Sought {
 }
 interface SweepAxis { key: string; label: string; unit: string; values: number[]; is_log: boolean }
 interface SweepMessage {
-  kind: "sweep"; id: number; state: "running" | "stopped" | "done"; axes: SweepAxis[];
+  kind: "sweep"; id: number; state: "running" | "stopped" | "lost" | "done"; axes: SweepAxis[];
   results: { measure: string; label: string; subject: string; unit: string }[]; n_points: number; points: (number | string | null)[][];
   start: { settings: (number | null)[]; results: (number | string | null)[] | null }; problem: string; n_failed: number;
 }

@@ -13,7 +13,7 @@ from reference.accessibility import violations
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import change, has_picture, set_value, setting, until
+from studio.page_tools import Server, change, has_picture, set_value, setting, until
 
 from foveasim.config import build_shot, put_setting
 
@@ -216,6 +216,31 @@ def test_page_is_usable_during_a_sweep(visit):
     choose_axis(page, "Setting", "optics.f_number", n=2)
     run(page)
     assert len(values(page)) == 2
+
+
+def test_restarted_server_ends_the_sweep(visit, tmp_path):
+    """Results so far remain; the new session has no sweep to cancel, and no file of it."""
+    own = Server(tmp_path)
+    try:
+        page = open_sweep(visit, is_checked=False, address=own.address)
+        choose_axis(page, "Setting", "layout.parameters.n_sectors", low=24, high=200, n=60)
+        page.click("#tile-sweep button:text-is('Run')")
+        until(page, "() => studio.views.made.sweep.points?.values.length > 1")
+        own.stop()
+        until(page, "() => document.body.classList.contains('offline')")
+        n_done = page.evaluate("studio.page.sweep.points.length")
+        own.start()
+        until(page, "() => studio.isReady && !document.body.classList.contains('offline')")
+
+        assert page.inner_text("#sweep-text") == f"The server was restarted after {n_done} of 60 points."
+        assert page.is_hidden("#tile-sweep button[aria-label='Cancel the sweep']")
+        assert page.is_hidden("#tile-sweep button:text-is('Sweep file')")
+        assert page.evaluate("studio.views.made.sweep.points.values.length") == n_done
+        choose_axis(page, "Setting", "optics.f_number", n=2)
+        run(page)
+        assert page.is_visible("#tile-sweep button:text-is('Sweep file')")
+    finally:
+        own.stop()
 
 
 def test_wrong_input_is_explained(visit):

@@ -195,7 +195,7 @@ function receive(message, { isFailed }) {
   else if (kind === "gaze_path") gazePanel.usePath(message);
   else if (kind === "saved") notice("Saved as " + message.path);
   else if (kind === "sought") views.show("goal", true).then(() => views.made.goal?.show(message));
-  else if (kind === "sweep") { page.sweep = message; views.made.sweep?.show(message); }
+  else if (kind === "sweep") showSweep(message);
   else if (kind === "exists") files.askToReplace(message);
   else if (kind === "note") notice(message.text);
   else if (kind === "progress") { showStage(message.text); return; }
@@ -276,6 +276,12 @@ function showState(message) {
   gazePanel.use(message);
 }
 
+/** @param {SweepMessage} message */
+function showSweep(message) {
+  page.sweep = message;
+  views.made.sweep?.show(message);
+}
+
 /** @param {Hello} message @param {{ isSame: boolean }} about */
 function hello(message, { isSame }) {
   document.title = (message.name ? message.name + " – " : "") + "foveasim studio";
@@ -286,6 +292,8 @@ function hello(message, { isSame }) {
   views.describe(message.views);
   followSignals();
   const stored = message.is_new ? memory.get("settings") : null;
+  // A new session does not continue the sweep of the one before.
+  if (message.is_new && page.sweep?.state === "running") showSweep({ ...page.sweep, state: "lost" });
   sendViews();
   if (page.kept.length) connection.send({ do: "pin", sites: page.kept });
   const compared = JSON.parse(memory.get("compared") || "[]");

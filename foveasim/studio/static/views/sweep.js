@@ -138,13 +138,16 @@ export function create(root, studio) {
   /** @param {SweepMessage} message */
   function tell({ state, n_points: n, points: done, problem, n_failed: nFailed }) {
     const missing = nFailed ? " " + nFailed + " without a result: " + problem : "";
-    const words = { running: RUNNING, stopped: "Cancelled after " + done.length + " of " + n + " points.", done: n + " points." };
+    const part = done.length + " of " + n + " points.";
+    const lost = "The server was restarted after " + part;
+    const words = { running: RUNNING, stopped: "Cancelled after " + part, lost, done: n + " points." };
     // Screen readers announce changes of this text, not each point.
     change(text, { textContent: words[state] + missing });
     change(bar, { hidden: state !== "running", max: n, value: done.length });
     change(stop, { hidden: state !== "running" });
     bar.title = done.length + " of " + n + " points";
-    row.hidden = file.hidden = false;
+    row.hidden = false;
+    file.hidden = state === "lost"; // the server does not know the sweep
   }
 
   form.run.addEventListener("click", () => {
