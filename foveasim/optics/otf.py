@@ -144,15 +144,18 @@ class PlaneTables:
         if weights:
             self._compute(weights)
 
-    def _compute(self, weights: Sequence[Floats]) -> None:
+    def _compute(self, weights: Sequence[Floats]) -> dict[bytes, NDArray[Any]]:
+        """Return the table of at least the first sum, and cache as many as the limit admits."""
+        known, requested = self._cache, weights[0].tobytes()
         n_cached = max(
             1, (MAX_TABLE_SIZE if len(self._points_um) == 1 else MAX_CACHE_SIZE) // (2 * self._n_lags + 1) ** 2
         )
-        weights = [w for w in weights if w.tobytes() not in self._cache][:n_cached]
-        if len(self._cache) + len(weights) > n_cached:
-            self._cache.clear()
+        weights = [w for w in weights if w.tobytes() not in known][:n_cached]
         if not weights:
-            return
+            return known
+        # Other threads may read the cache: it is replaced, never changed.
+        if len(known) + len(weights) > n_cached:
+            self._cache = known = {requested: known[requested]} if requested in known else {}
         of_mode = np.reshape(weights, (len(weights), len(self._combinations), -1))
         # Sums over the wavelengths at each point, which modes share.
         spectra, which = np.unique(of_mode.reshape(-1, of_mode.shape[2]), axis=0, return_inverse=True)
@@ -171,7 +174,8 @@ class PlaneTables:
                 tables = [each[k] for each in found]
                 if tables[0] is not None:
                     self._add(sums, parts[:, k, at.start : at.stop], tables)
-        self._cache |= {weight.tobytes(): total for weight, total in zip(weights, sums, strict=True)}
+        self._cache = known = known | {weight.tobytes(): total for weight, total in zip(weights, sums, strict=True)}
+        return known
 
     def _add(self, sums: NDArray[Any], weights: Floats, tables: Sequence[NDArray[Any] | None]) -> None:
         """Add ``weights @ tables`` to sums, of one point or of several."""
@@ -204,11 +208,12 @@ class PlaneTables:
     def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
         """Return the table, and its steps per frequency (µm)."""
         key = weight.tobytes()
-        if key not in self._cache:
+        found = self._cache.get(key)
+        if found is None:
             # With those that are requested next.
             keys = [each.tobytes() for each in self._sums]
-            self._compute(self._sums[keys.index(key) :] if key in keys else [weight])
-        return self._cache[key], self._per_step
+            found = self._compute(self._sums[keys.index(key) :] if key in keys else [weight])[key]
+        return found, self._per_step
 
     @property
     def size(self) -> int:
