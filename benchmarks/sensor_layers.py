@@ -42,7 +42,7 @@ def bench_layer(report: Report, n_pictures: int, n_pixels: int, device: torch.de
     pictures = torch.rand(n_pictures, 3, n_pixels, n_pixels, device=device)
     imaging = layer.model.imaging
     width, _ = imaging.padded_columns
-    parts = imaging.split(pictures)
+    parts = imaging.split(pictures).slices
     padded = torch.rand(n_pictures, 3, width, width, device=device)
     spectra = torch.fft.rfft2(padded)
     cells = torch.rand(n_pixels * width, 3 * n_pictures, device=device)

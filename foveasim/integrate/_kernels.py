@@ -842,7 +842,7 @@ def multiply_rows(row_begin, column, weights, cells, sums):
     """
     for site in range(sums.shape[1]):
         for k in range(sums.shape[0]):
-            total = weights.dtype.type(0.0)
+            total = 0.0  # in double precision: a site may have many cells
             for i in range(np.uintp(row_begin[site]), np.uintp(row_begin[site + 1])):
                 total += weights[i] * cells[k, np.uintp(column[i])]
             sums[k, site] = total

@@ -717,13 +717,23 @@ def _is_packed(polygons: Any) -> bool:
     """Return whether polygons are packed rings: vertices, and two sequences of offsets."""
     if not (isinstance(polygons, tuple) and len(polygons) == 3):
         return False
-    offsets = polygons[1]
-    return not isinstance(offsets, shapely.Geometry) and not (_is_vertices(offsets) and len(offsets) > 2)
+    if any(isinstance(each, shapely.Geometry) for each in polygons):
+        return False
+    shapes = [_shape(each) for each in polygons]
+    return any(len(shape) < 2 for shape in shapes[1:]) and any(shape != (2,) for shape in shapes)
+
+
+def _shape(values: Any) -> tuple[int, ...]:
+    """Return the shape of an array-like; (0, 0) for sequences of different lengths."""
+    try:
+        return np.shape(values)
+    except ValueError:
+        return 0, 0
 
 
 def _is_vertices(outline: Any) -> bool:
     """Return whether an outline is an array (n, 2) of numbers."""
-    if isinstance(outline, shapely.Geometry) or not isinstance(outline, Sequence | np.ndarray):
+    if isinstance(outline, shapely.Geometry):
         return False
     try:
         found = np.asarray(outline)
@@ -747,7 +757,9 @@ def _pack_polygons(polygons: Any) -> tuple[Floats, Ints, Ints]:
         outline = outlines[number]
         if not _is_vertices(outline):
             is_geometry = isinstance(outline, shapely.Geometry)
+            is_point = not is_geometry and _shape(outline) == (2,)
             hint = "; pass each of its parts as a separate site" if is_geometry else ""
+            hint = "; pass [vertices] for a single site" if is_point else hint
             raise GeometryError(
                 f"site {number} must be a shapely Polygon, or vertices (n, 2), got {type_name(outline)}{hint}",
                 (number,),

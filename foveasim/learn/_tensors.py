@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
-from functools import partial
-from threading import Lock
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache, partial
+from threading import Barrier, Lock
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
+from torch.utils._python_dispatch import _get_current_dispatch_mode
 
-from foveasim._core.threads import parallel_map, thread_count
+from foveasim._core.threads import thread_count
 from foveasim.errors import ParameterError, type_name
 from foveasim.integrate._kernels import multiply_rows
 
@@ -164,7 +167,11 @@ class SparseMap:
         get, matrix = partial(self._constants.get, like=like), self._matrix
         begin = get("begin", compute=lambda: matrix.indptr.astype(np.int32))
         column = get("columns", compute=lambda: matrix.indices.astype(np.int32))
-        return begin.numpy(), column.numpy(), get("elements", compute=lambda: matrix.data).numpy()
+        return (
+            begin.numpy(),
+            column.numpy(),
+            get("elements", compute=lambda: np.asarray(matrix.data, np.float64)).numpy(),
+        )
 
     def apply(self, values: Tensor) -> Tensor:
         """Return the products (..., m) of rows (..., n)."""
@@ -209,23 +216,34 @@ def is_array(tensor: Tensor) -> bool:
     """
     Return whether a tensor is a mere array for kernels.
 
-    In memory, and without derivatives and transforms.
+    In memory, and without derivatives, transforms, tracers and modes that see operations.
     """
     if type(tensor) is not Tensor or tensor.device.type != "cpu" or tensor.dtype not in (torch.float32, torch.float64):
         return False
     is_tracked = (tensor.requires_grad and torch.is_grad_enabled()) or unpack_dual(tensor).tangent is not None
-    if is_tracked or torch.compiler.is_compiling():
+    is_traced = torch.compiler.is_compiling() or torch.jit.is_tracing() or _get_current_dispatch_mode() is not None
+    if is_tracked or is_traced or tensor.is_neg():
+        return False
+    probe = tensor.new_empty(0)
+    if torch._is_functional_tensor(probe):  # noqa: SLF001 -- no public function says so
         return False
     try:
-        tensor.new_empty(0).numpy()
-    except RuntimeError:  # within a transform of torch.func
+        probe.numpy()
+    except RuntimeError:  # within another transform of torch.func
         return False
     return True
 
 
+class Parts(NamedTuple):
+    """Parts of the rows of tensors, and how many may be computed at the same time."""
+
+    slices: Sequence[slice] = (slice(None),)
+    n_together: int = 1
+
+
 def in_parts(
     compute: Callable[..., Tensor],
-    parts: Sequence[slice],
+    parts: Parts,
     *tensors: Tensor | None,
     finish: Callable[[Tensor], Tensor] = lambda result: result,
 ) -> Tensor:
@@ -239,56 +257,74 @@ def in_parts(
     ----------
     compute : callable
         Of a part of each tensor.
-    parts : sequence of slice
+    parts : Parts
     *tensors : tensor or None
     finish : callable
         Of the result of each part, in the order of the parts, as random numbers require.
     """
+    first_part, *others = parts.slices
 
     def result_of(part: slice) -> Tensor:
         return compute(*(None if each is None else each[part] for each in tensors))
 
-    first = finish(result_of(parts[0]))  # creates the constants
-    if len(parts) == 1:
+    first = finish(result_of(first_part))  # creates the constants
+    if not others:
         return first
     if first.requires_grad:
-        return torch.cat([first, *(finish(result_of(part)) for part in parts[1:])])
+        return torch.cat([first, *(finish(result_of(part)) for part in others)])
     # Results that stay in memory between those of other parts would fragment it.
-    rows = first.new_empty(parts[-1].stop, *first.shape[1:])
-    rows[parts[0]] = first
+    rows = first.new_empty(others[-1].stop, *first.shape[1:])
+    rows[first_part] = first
     del first
-    n_threads = _count_threads(len(parts) - 1) if is_array(rows) else 1
-    n_own, is_inference = torch.get_num_threads(), torch.is_inference_mode_enabled()
+    n_threads, is_inference = _count_threads(parts) if is_array(rows) else 1, torch.is_inference_mode_enabled()
+    if n_threads == 1:
+        for part in others:
+            rows[part] = finish(result_of(part))
+        return rows
     results: dict[int, Tensor] = {}
-    waiting, lock = deque(parts[1:]), Lock()
+    waiting, lock = deque(others), Lock()
 
     def compute_alone(part: slice) -> None:
-        torch.set_num_threads(1)
-        try:
-            with torch.inference_mode(is_inference), torch.no_grad():
-                result = result_of(part)
-                with lock:
-                    results[part.start] = result
-                    while waiting and waiting[0].start in results:
-                        ready = waiting.popleft()
-                        rows[ready] = finish(results.pop(ready.start))
-        finally:
-            torch.set_num_threads(n_own)
+        with torch.inference_mode(is_inference), torch.no_grad():
+            result = result_of(part)
+            with lock:
+                results[part.start] = result
+                while waiting and waiting[0].start in results:
+                    ready = waiting.popleft()
+                    rows[ready] = finish(results.pop(ready.start))
 
-    if n_threads > 1:
-        parallel_map(compute_alone, parts[1:], n_threads)
-    else:
-        for part in parts[1:]:
-            rows[part] = finish(result_of(part))
+    tasks = [_pool(n_threads).submit(compute_alone, part) for part in others]
+    try:
+        for task in tasks:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        wait(tasks)
     return rows
 
 
-def _count_threads(n_parts: int) -> int:
+def _count_threads(parts: Parts) -> int:
     """Return the number of threads that compute parts, or 1 where all work on each part."""
     if torch.is_autocast_enabled("cpu"):  # which other threads do not know
         return 1
-    n_threads = min(torch.get_num_threads(), thread_count())
-    return n_threads if 2 * n_parts > n_threads else 1
+    n_threads, n_parts = min(torch.get_num_threads(), thread_count()), len(parts.slices) - 1
+    return min(n_threads, parts.n_together) if 2 * n_parts > n_threads else 1
+
+
+@cache
+def _pool(n_threads: int) -> ThreadPoolExecutor:
+    """Return threads in which operations of torch use one thread each."""
+    n_own, start = torch.get_num_threads(), Barrier(n_threads)
+    pool = ThreadPoolExecutor(n_threads, "foveasim layers", torch.set_num_threads, (1,))
+    wait([pool.submit(start.wait) for _ in range(n_threads)])
+    # The last number that any thread sets is the default of those that start later.
+    torch.set_num_threads(n_own)
+    return pool
+
+
+if hasattr(os, "register_at_fork"):  # a forked process does not inherit the threads of its parent
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def constant(values: Any) -> Tensor:

@@ -24,7 +24,7 @@ from foveasim._core.validation import Floats, Ints
 from foveasim._io.mapped_files import in_memory
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, SceneLike
-from foveasim.learn._tensors import Constants, check_tensor, constant, in_parts, is_array
+from foveasim.learn._tensors import Constants, Parts, check_tensor, constant, in_parts, is_array
 from foveasim.optics import Optics, PupilImage, Seidel, Zernike, zernike
 from foveasim.optics._aperture import PUPIL_POINTS, Aperture, overlaps
 from foveasim.optics._imaging import PatchExtent
@@ -42,6 +42,8 @@ VARIABLES = ("zernike", "seidel", "defocus", "pupil")
 PATCHES = 5
 #: Number of cells, of all padded basis images, that a processor transforms at once: they stay in its cache.
 MAX_PART = 2**21
+#: Number of cells, of all padded basis images, that all threads transform at the same time: some 1 GiB in single precision.
+MAX_CELLS = 2**26
 #: Largest number of runs of pixels that are copied with derivatives; others are looked up.
 MAX_RUNS = 8
 #: Coefficients of Seidel aberrations, in the order of the tensor.
@@ -267,14 +269,15 @@ class Imaging(nn.Module):
             found.append(torch.einsum("cbk,kyx->cbyx", (per_image * transmittance).to(factors.dtype), factors))
         return found
 
-    def split(self, scenes: Tensor, n_shifts: int = 1) -> list[slice]:
+    def split(self, scenes: Tensor, n_shifts: int = 1) -> Parts:
         """Return the parts of a batch that are imaged at once, with some shifts each."""
         if scenes.device.type != "cpu" or torch.compiler.is_compiling():
-            return [slice(None)]
+            return Parts()
         n_cells = sum(rows.cells.size * columns.cells.size for _, rows, columns in self._patches)
         n_cells *= n_shifts * self._scene.basis.shape[0] * self._n_modes * self._imaging.oversample**2
-        n, n_scenes = max(1, MAX_PART // n_cells), scenes.shape[0]
-        return [slice(k, min(k + n, n_scenes)) for k in range(0, n_scenes, n)] or [slice(None)]
+        n, n_scenes = max(1, MAX_PART // max(1, n_cells)), scenes.shape[0]
+        parts = [slice(k, min(k + n, n_scenes)) for k in range(0, n_scenes, n)]
+        return Parts(parts, max(1, MAX_CELLS // (n * n_cells))) if parts and n_cells else Parts()
 
     def filtered(self, basis: Tensor, transfer: Sequence[Tensor]) -> Tensor:
         """
@@ -581,6 +584,7 @@ class _Padding:
 
     def __init__(self, rows: PatchExtent, columns: PatchExtent, window: Floats, n_y: int) -> None:
         self._runs = _runs(columns.sources)
+        self._run_array = np.array(self._runs, np.int64).reshape(-1, 3)
         self._is_even = bool(np.all(window == 1.0))
         self._is_whole = np.array_equal(rows.sources, np.arange(n_y))
         self._constants = Constants(
@@ -596,20 +600,20 @@ class _Padding:
             found = pictures.new_empty(*pictures.shape[:-2], *window.shape)
             flat = pictures.reshape(-1, *pictures.shape[-2:]).contiguous()
             padded = found.view(-1, *window.shape).numpy()
-            pad_pictures(flat.numpy(), rows.numpy(), self._runs, window.numpy(), padded)
+            pad_pictures(flat.numpy(), rows.numpy(), self._run_array, window.numpy(), padded)
         else:
             if origin == "upper" or not self._is_whole:
                 pictures = pictures.index_select(-2, rows)
             if len(self._runs) <= MAX_RUNS:
-                found = torch.cat([_run(pictures, *each) for each in self._runs.tolist()], dim=-1)
+                found = torch.cat([_run(pictures, *each) for each in self._runs], dim=-1)
             else:
                 found = pictures.index_select(-1, columns)
             found = found if self._is_even else found * window
         return nn.functional.pad(found, self._zeros) if any(self._zeros) else found
 
 
-def _runs(sources: Ints) -> Ints:
-    """Return the first pixel, the length and the step (1, -1 or 0) of runs of pixels, (n, 3)."""
+def _runs(sources: Ints) -> list[tuple[int, int, int]]:
+    """Return the first pixel, the length and the step (1, -1 or 0) of runs of pixels."""
     runs: list[tuple[int, int, int]] = []
     k = 0
     while k < sources.size:
@@ -620,7 +624,7 @@ def _runs(sources: Ints) -> Ints:
             n += 1
         runs.append((int(sources[k]), n, step))
         k += n
-    return np.array(runs, np.int64).reshape(-1, 3)
+    return runs
 
 
 def _run(values: Tensor, first: int, n: int, step: int) -> Tensor:

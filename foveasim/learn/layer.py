@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -33,7 +34,8 @@ class SensorLayer(nn.Module):
     Camera as a layer of a network.
 
     Pictures pass the optics, are integrated over the photosites, become charges with noise, and then codes. All operations are
-    those of PyTorch on the device of the pictures, so that gradients pass to the pictures, and to the variables of the camera.
+    those of PyTorch on the device of the pictures, so that gradients pass to the pictures, and to the variables of the camera;
+    on the CPU, kernels replace some of them where no gradients are needed.
 
     Parameters
     ----------
@@ -287,7 +289,22 @@ class SensorLayer(nn.Module):
                 charge_e = self.readout.draw(charge_e, generator)
             return charge_e if self.output == "charge" else self.readout.code(charge_e)
 
-        return self._finished(pictures, gaze_um, self._expected_e if self.output == "expected" else read)
+        if self.output == "expected":
+            return self._finished(pictures, gaze_um, self._expected_e)
+        with _unchanged_on_error(generator if self.noise else None):
+            return self._finished(pictures, gaze_um, read)
+
+
+@contextmanager
+def _unchanged_on_error(generator: torch.Generator | None) -> Iterator[None]:
+    """Restore the state of a generator after an error, before which parts may have been drawn."""
+    state = None if generator is None or torch.compiler.is_compiling() else generator.get_state()
+    try:
+        yield
+    except BaseException:
+        if generator is not None and state is not None:
+            generator.set_state(state)
+        raise
 
 
 def _template(shape: Any) -> Scene:

@@ -17,7 +17,7 @@ from foveasim.camera._footprints import placed
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator, UndistortedOutlines
-from foveasim.learn._tensors import Constants, SparseMap, check_tensor, checked_gazes, constant, in_parts
+from foveasim.learn._tensors import Constants, Parts, SparseMap, check_tensor, checked_gazes, constant, in_parts
 from foveasim.learn.distortion import coefficient_names, coefficient_values, undistort, with_coefficients
 from foveasim.learn.imaging import VARIABLES as LENS_VARIABLES
 from foveasim.learn.imaging import Imaging, Origin, _check_variables, interleaved
@@ -249,8 +249,10 @@ class Model(nn.Module):
             maps = self.imaging.outputs(part, transfer, shift, origin=origin, is_padded=is_padded)
             return self._integrated(maps).reshape(-1, 1 if shift is None else shift.shape[1], self.n_sites)
 
-        found = in_parts(integrated, self.parts(flat, shift), flat, shift)
         shape = basis.shape[:-3] if gaze_um is None else gaze_um.shape[:-1]
+        if 0 in shape:
+            return basis.new_zeros(*shape, self.n_sites)
+        found = in_parts(integrated, self.parts(flat, shift), flat, shift)
         return self._collect(found.reshape(*shape, self.n_sites) * float(w_from_w_m2_um2(1.0)))
 
     def overlaps(self, like: Tensor) -> list[Tensor]:
@@ -265,10 +267,10 @@ class Model(nn.Module):
         """
         return [matrix.tensor(like) for matrix in self._matrices]
 
-    def parts(self, scenes: Tensor, gazes: Tensor | None = None) -> list[slice]:
+    def parts(self, scenes: Tensor, gazes: Tensor | None = None) -> Parts:
         """Return the parts of a batch that are computed at once; (n_scene, n_gaze, 2) gazes."""
         if not self._matrices:  # sites that move are compiled for all maps of the batch
-            return [slice(None)]
+            return Parts()
         return self.imaging.split(scenes, 1 if gazes is None else gazes.shape[1])
 
     def _integrated(self, maps: Iterable[Tensor]) -> Tensor:

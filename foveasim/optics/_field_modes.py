@@ -98,6 +98,10 @@ class FieldModes:
 
     __repr__ = short_repr
 
+    def __post_init__(self) -> None:
+        for values in (self.points_um, self.combinations, self.at_points, self.singular_values):
+            values.setflags(write=False)  # the cache of the lens has them
+
     @property
     def n_modes(self) -> int:
         """Number of modes, that of the mean included."""

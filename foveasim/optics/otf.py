@@ -155,7 +155,10 @@ class PlaneTables:
             return known
         # Other threads may read the cache: it is replaced, never changed.
         if len(known) + len(weights) > n_cached:
-            self._cache = known = {requested: known[requested]} if requested in known else {}
+            known = {requested: known[requested]} if requested in known else {}
+            weights, self._cache = weights[: n_cached - len(known)], known
+            if not weights:
+                return known
         of_mode = np.reshape(weights, (len(weights), len(self._combinations), -1))
         # Sums over the wavelengths at each point, which modes share.
         spectra, which = np.unique(of_mode.reshape(-1, of_mode.shape[2]), axis=0, return_inverse=True)

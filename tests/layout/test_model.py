@@ -314,6 +314,21 @@ def test_array_of_equal_outlines_is_accepted():
     assert Layout.from_polygons(corners).area_um2.tolist() == [1.0] * 5
 
 
+@pytest.mark.parametrize("kind", [list, tuple, np.array])
+def test_one_outline_requires_a_list(kind):
+    with pytest.raises(GeometryError, match=r"site 0 must be .* got .*; pass \[vertices\] for a single site"):
+        Layout.from_polygons(kind([(0.0, 0.0), (2.0, 0.0), (0.0, 2.0)]))
+
+
+def test_short_outline_in_a_tuple_is_named():
+    with pytest.raises(GeometryError, match="site 1 has a ring of fewer than 3 distinct vertices"):
+        Layout.from_polygons((OUTLINES[0], [(0, 0), (1, 1)], OUTLINES[2]))
+
+
+def test_coordinates_of_shapely_are_vertices():
+    assert Layout.from_polygons([shapely.box(0, 0, 2, 3).exterior.coords]).area_um2.tolist() == [6.0]
+
+
 def test_packed_rings_are_not_taken_for_outlines():
     layout = Layout.from_polygons(([(0, 0), (2, 0), (2, 2)], [0, 3], [0, 1]))
 

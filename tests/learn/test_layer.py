@@ -6,11 +6,13 @@ import copy
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from threading import Thread
 
 import numpy as np
 import pytest
 import torch
 from torch.func import functional_call
+from torch.fx.experimental.proxy_tensor import make_fx
 
 import foveasim as fs
 from foveasim import learn
@@ -389,6 +391,74 @@ def test_errors_of_parts_are_raised():
 
     with pytest.raises(fs.errors.ParameterError, match="must be finite"):
         layer(pictures)
+
+
+@pytest.mark.usefixtures("one_picture_per_part")
+def test_rejected_batches_draw_no_random_numbers():
+    layer = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S)
+    pictures, generator = torch.rand(7, 3, *SHAPE), torch.Generator().manual_seed(4)
+    state = generator.get_state()
+    pictures[6] = -1.0
+    with pytest.raises(fs.errors.ParameterError, match="must be >= 0"):
+        layer(pictures, generator=generator)
+
+    assert torch.equal(generator.get_state(), state)
+
+
+@pytest.mark.usefixtures("one_picture_per_part")
+def test_threads_of_others_keep_their_number():
+    layer = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S)
+    layer(torch.rand(7, 3, *SHAPE))
+    found = []
+    for _ in range(3):
+        thread = Thread(target=lambda: found.append(torch.get_num_threads()))
+        thread.start()
+        layer(torch.rand(7, 3, *SHAPE))
+        thread.join()
+
+    assert found == [4, 4, 4]
+
+
+@pytest.mark.parametrize("n_columns", [1, 2])
+def test_large_sites_are_summed_precisely(n_columns):
+    layout = fs.layout.grid(n_columns, n_columns, 400.0 / n_columns)
+    layer = learn.SensorLayer(
+        fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout)), scene_shape=(1, 400, 400), exposure_s=EXPOSURE_S
+    )
+    white = torch.full((1, 1, 400, 400), 0.3)
+    with torch.no_grad():
+        found, expected = layer.photo_e_per_s(white), layer.photo_e_per_s(white.double())
+
+    torch.testing.assert_close(found.double(), expected, rtol=2e-6, atol=0.0)
+
+
+@pytest.mark.parametrize("shape", [(0,), (2, 0)])
+def test_empty_batches_have_empty_results(shape):
+    layer = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S)
+
+    assert layer(torch.rand(*shape, 3, *SHAPE)).shape == (*shape, layer.n_sites)
+    assert layer(torch.rand(2, 3, *SHAPE), torch.zeros(2, 0, 2)).shape == (2, 0, layer.n_sites)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.trace")
+def test_tracers_see_all_operations():
+    imaging = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S).model.imaging
+    first, other = (torch.rand(2, 3, *SHAPE, dtype=torch.float64) for _ in range(2))
+    expected = imaging(basis=other)
+
+    for make in (
+        lambda function: torch.jit.trace(function, first, check_trace=False),
+        lambda function: make_fx(function)(first),
+        torch.func.functionalize,
+    ):
+        torch.testing.assert_close(make(lambda each: imaging(basis=each))(other), expected)
+
+
+def test_negative_views_are_read():
+    layer = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S, output="expected")
+    pictures = torch.rand(2, 3, *SHAPE)
+
+    torch.testing.assert_close(layer(torch._neg_view(-pictures)), layer(pictures))
 
 
 @pytest.mark.usefixtures("one_picture_per_part")

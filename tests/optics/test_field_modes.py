@@ -216,6 +216,8 @@ def test_modes_are_those_of_maps():
 
     assert modes.displaced == LENS.field_error(noise())
     assert modes.n_modes == len(modes.at_points)
+    with pytest.raises(ValueError, match="read-only"):
+        modes.at_points[0] = 0.0
     assert np.all(np.diff(modes.singular_values) <= 0.0)
     np.testing.assert_allclose(modes.combinations.sum(axis=1), [1.0] + [0.0] * (modes.n_modes - 1), atol=1e-9)
     assert replace(LENS, field_modes=3).psf_modes(noise()).n_modes == 4

@@ -63,6 +63,13 @@ def test_sums_of_others_may_displace_those_requested(tables, monkeypatch):
     np.testing.assert_array_equal(tables(np.eye(3)[0])[0], expected)
 
 
+def test_prepared_sums_are_limited_with_cached_ones(tables):
+    table, _ = tables(np.eye(3)[0])
+    tables.prepare([*np.eye(3), np.ones(3)])
+
+    assert tables.size <= 2 * table.size
+
+
 def test_prepared_sums_are_limited(tables):
     tables.prepare([*np.eye(3), np.ones(3)])
     table, _ = tables(np.eye(3)[2])

@@ -232,13 +232,19 @@ def test_restarted_server_ends_the_sweep(visit, tmp_path):
         own.start()
         until(page, "() => studio.isReady && !document.body.classList.contains('offline')")
 
-        assert page.inner_text("#sweep-text") == f"The server was restarted after {n_done} of 60 points."
+        assert page.inner_text("#sweep-text") == f"The session ended after {n_done} of 60 points."
         assert page.is_hidden("#tile-sweep button[aria-label='Cancel the sweep']")
         assert page.is_hidden("#tile-sweep button:text-is('Sweep file')")
         assert page.evaluate("studio.views.made.sweep.points.values.length") == n_done
         choose_axis(page, "Setting", "optics.f_number", n=2)
         run(page)
         assert page.is_visible("#tile-sweep button:text-is('Sweep file')")
+        own.stop()
+        until(page, "() => document.body.classList.contains('offline')")
+        own.start()
+        until(page, "() => studio.isReady && !document.body.classList.contains('offline')")
+        assert page.inner_text("#sweep-text") == "2 points."
+        assert page.is_hidden("#tile-sweep button:text-is('Sweep file')")
     finally:
         own.stop()
 

@@ -93,10 +93,11 @@ export class Connection {
   /** @type {Map<string, { id: number, value: unknown }>} */ unanswered = new Map();
   isSilent = false; silence = 0;
 
-  // isSame: whether the token is that of an earlier connection; isFailed: whether a message of the page failed.
+  // isSame, isContinued: whether the token or the session is that of an earlier connection; isFailed: whether a message of the page failed.
   /**
    * @typedef {{
-   *   hello: (message: Hello, about: { isSame: boolean }) => void, message: (message: ServerMessage, about: { isFailed: boolean }) => void,
+   *   hello: (message: Hello, about: { isSame: boolean, isContinued: boolean }) => void,
+   *   message: (message: ServerMessage, about: { isFailed: boolean }) => void,
    *   part: (part: Part) => void, status: (status: "open" | "lost" | "denied") => void, silent: (isSilent: boolean) => void,
    * }} Listeners
    * @param {Listeners} on
@@ -153,12 +154,12 @@ export class Connection {
   _receive(message) {
     const { requests } = this;
     if (message.kind === "hello") {
-      const isSame = memory.get("token") === this.token;
+      const isSame = memory.get("token") === this.token, isContinued = memory.get("session") === message.session;
       this.isOpen = true;
       this.delay = FIRST_DELAY_MS;
       memory.set("token", this.token);
       memory.set("session", message.session);
-      this.on.hello(message, { isSame });
+      this.on.hello(message, { isSame, isContinued });
       this.on.status("open");
       for (const [key, value] of this.unsent) this.set(key, value, true);
       this.unsent.clear();

@@ -282,8 +282,8 @@ function showSweep(message) {
   views.made.sweep?.show(message);
 }
 
-/** @param {Hello} message @param {{ isSame: boolean }} about */
-function hello(message, { isSame }) {
+/** @param {Hello} message @param {{ isSame: boolean, isContinued: boolean }} about */
+function hello(message, { isSame, isContinued }) {
   document.title = (message.name ? message.name + " – " : "") + "foveasim studio";
   controls.describe(message.controls);
   controls.forgetSent();
@@ -292,8 +292,11 @@ function hello(message, { isSame }) {
   views.describe(message.views);
   followSignals();
   const stored = message.is_new ? memory.get("settings") : null;
-  // A new session does not continue the sweep of the one before.
-  if (message.is_new && page.sweep?.state === "running") showSweep({ ...page.sweep, state: "lost" });
+  // Another session does not have the sweep of the one before.
+  if (page.sweep && !isContinued) {
+    const { state } = page.sweep;
+    showSweep({ ...page.sweep, state: state === "running" ? "lost" : state, isLost: true });
+  }
   sendViews();
   if (page.kept.length) connection.send({ do: "pin", sites: page.kept });
   const compared = JSON.parse(memory.get("compared") || "[]");

@@ -136,10 +136,10 @@ export function create(root, studio) {
   }
 
   /** @param {SweepMessage} message */
-  function tell({ state, n_points: n, points: done, problem, n_failed: nFailed }) {
+  function tell({ state, n_points: n, points: done, problem, n_failed: nFailed, isLost }) {
     const missing = nFailed ? " " + nFailed + " without a result: " + problem : "";
     const part = done.length + " of " + n + " points.";
-    const lost = "The server was restarted after " + part;
+    const lost = "The session ended after " + part;
     const words = { running: RUNNING, stopped: "Cancelled after " + part, lost, done: n + " points." };
     // Screen readers announce changes of this text, not each point.
     change(text, { textContent: words[state] + missing });
@@ -147,7 +147,7 @@ export function create(root, studio) {
     change(stop, { hidden: state !== "running" });
     bar.title = done.length + " of " + n + " points";
     row.hidden = false;
-    file.hidden = state === "lost"; // the server does not know the sweep
+    file.hidden = Boolean(isLost); // the server does not know the sweep
   }
 
   form.run.addEventListener("click", () => {
