@@ -440,7 +440,7 @@ def test_empty_batches_have_empty_results(shape):
     assert layer(torch.rand(2, 3, *SHAPE), torch.zeros(2, 0, 2)).shape == (2, 0, layer.n_sites)
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.trace")
+@pytest.mark.filterwarnings("ignore:`torch.jit.trace", "ignore::torch.jit.TracerWarning")
 def test_tracers_see_all_operations():
     imaging = learn.SensorLayer(camera(), scene(), exposure_s=EXPOSURE_S).model.imaging
     first, other = (torch.rand(2, 3, *SHAPE, dtype=torch.float64) for _ in range(2))
