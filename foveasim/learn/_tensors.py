@@ -21,7 +21,6 @@ from torch.utils._python_dispatch import _get_current_dispatch_mode
 
 from foveasim._core.threads import thread_count
 from foveasim.errors import ParameterError, type_name
-from foveasim.integrate._kernels import multiply_rows
 
 #: Number of times that a step is halved before it is cancelled.
 MAX_HALVINGS = 8
@@ -177,6 +176,8 @@ class SparseMap:
         """Return the products (..., m) of rows (..., n)."""
         rows = values.reshape(-1, self.shape[1])
         if is_array(rows) and self._matrix.nnz < 2**31:
+            from foveasim.integrate._kernels import multiply_rows
+
             found = rows.new_empty(rows.shape[0], self.shape[0])
             multiply_rows(*self._arrays(rows), rows.contiguous().numpy(), found.numpy())
         elif torch.compiler.is_compiling():  # in operations that other runtimes have

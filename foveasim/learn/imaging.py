@@ -28,7 +28,6 @@ from foveasim.learn._tensors import Constants, Parts, check_tensor, constant, in
 from foveasim.optics import Optics, PupilImage, Seidel, Zernike, zernike
 from foveasim.optics._aperture import PUPIL_POINTS, Aperture, overlaps
 from foveasim.optics._imaging import PatchExtent
-from foveasim.optics._kernels import pad_pictures
 from foveasim.units import um_from_nm
 
 __all__ = ["VARIABLES", "Imaging", "Origin"]
@@ -597,6 +596,8 @@ class _Padding:
         """Return the padded part of pictures (..., n_y, n_x), bottom row first."""
         window, rows, columns = (self._constants.get(name, pictures) for name in ("window", origin, "columns"))
         if is_array(pictures):
+            from foveasim.optics._kernels import pad_pictures
+
             found = pictures.new_empty(*pictures.shape[:-2], *window.shape)
             flat = pictures.reshape(-1, *pictures.shape[-2:]).contiguous()
             padded = found.view(-1, *window.shape).numpy()
