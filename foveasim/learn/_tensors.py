@@ -317,7 +317,12 @@ def _count_threads(parts: Parts) -> int:
 def _pool(n_threads: int) -> ThreadPoolExecutor:
     """Return threads in which operations of torch use one thread each."""
     n_own, start = torch.get_num_threads(), Barrier(n_threads)
-    pool = ThreadPoolExecutor(n_threads, "foveasim layers", torch.set_num_threads, (1,))
+
+    def initialise() -> None:
+        torch.get_num_threads()  # a later first request would set the default again
+        torch.set_num_threads(1)
+
+    pool = ThreadPoolExecutor(n_threads, "foveasim layers", initialise)
     wait([pool.submit(start.wait) for _ in range(n_threads)])
     # The last number that any thread sets is the default of those that start later.
     torch.set_num_threads(n_own)

@@ -17,6 +17,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 import foveasim as fs
 from foveasim import learn
 from foveasim.distortion import BrownConrady
+from foveasim.learn import _tensors
 from foveasim.optics import IlluminationTable, Seidel, Zernike
 from foveasim.sensor.effects import Diffusion, InterPixelCapacitance
 from foveasim.units import decode_srgb
@@ -417,6 +418,8 @@ def test_threads_of_others_keep_their_number():
         thread.join()
 
     assert found == [4, 4, 4]
+    used = _tensors._pool(3).map(lambda _: (torch.rand(1 << 20).add_(1.0), torch.get_num_threads())[1], range(6))
+    assert list(used) == [1] * 6
 
 
 @pytest.mark.parametrize("n_columns", [1, 2])
