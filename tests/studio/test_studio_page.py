@@ -30,6 +30,9 @@ from studio.page_tools import (
 
 pytestmark = pytest.mark.needs("chromium")
 
+# PATIENCE_MS of connection.js: a preview without an answer no longer delays the next one. Timers are early by up to 1 ms.
+PATIENCE_MS = 4000
+
 # -- views ------------------------------------------------------------------------------------------------------------------
 
 
@@ -309,14 +312,17 @@ def test_slider_back_at_start_is_released(visit):
 
 def test_previews_wait_for_answers(visit):
     page = visit()
-    page.evaluate("""() => { window.waits = []; const send = studio.connection.socket.send.bind(studio.connection.socket);
-      studio.connection.socket.send = (text) => { waits.push([JSON.parse(text).value, performance.now(), studio.connection.requests.nDone]); send(text); };
-      for (let k = 0; k < 50; k++) studio.connection.set("exposure_s", 0.01 + 0.001 * k, false); }""")
+    page.evaluate("""() => { window.sent = []; const { connection } = studio, send = connection.send.bind(connection);
+      connection.send = (message) => {
+        if (message.do === "set") sent.push({ ...message, ms: performance.now(), nDone: connection.requests.nDone });
+        return send(message);
+      };
+      for (let k = 0; k < 50; k++) connection.set("exposure_s", 0.01 + 0.001 * k, false); }""")
     until(page, "() => studio.isReady && studio.state.settings.exposure_s > 0.0589")
-    waits = page.evaluate("waits")
+    first, second = page.evaluate("sent")
 
-    assert [round(value, 6) for value, _, _ in waits] == [0.01, 0.059]
-    assert waits[1][2] > waits[0][2]
+    assert [round(message["value"], 6) for message in (first, second)] == [0.01, 0.059]
+    assert second["nDone"] > first["nDone"] or second["ms"] >= first["ms"] + PATIENCE_MS - 1
 
 
 def test_error_is_next_to_its_control(visit):
