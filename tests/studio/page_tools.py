@@ -121,6 +121,15 @@ def set_value(page, key, value):
     change(page, "([key, value]) => { studio.connection.set(key, value, true); }", [key, value])
 
 
+def record_changes(page):
+    """Record the changes of values that the page sends, with their times and the answers before them, in ``changes``."""
+    page.evaluate("""() => { window.changes = []; const { connection } = studio, send = connection.send.bind(connection);
+      connection.send = (message) => {
+        if (message.do === "set") changes.push({ ...message, ms: performance.now(), nDone: connection.requests.nDone });
+        return send(message);
+      }; }""")
+
+
 def setting(page, key):
     return page.evaluate("key => key.split('.').reduce((part, name) => part[name] ?? null, studio.state.settings)", key)
 

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import SHOT, change, set_value, setting, settle, until
+from studio.page_tools import SHOT, change, record_changes, set_value, setting, settle, until
 
 pytestmark = pytest.mark.needs("chromium")
 
@@ -140,8 +140,7 @@ def test_first_vertex_closes_polygon(edit):
 
 def test_rectangle_drag_is_one_step(edit):
     page = edit("rectangle")
-    page.evaluate("""() => { window.sent = []; const send = studio.connection.send.bind(studio.connection);
-      studio.connection.send = (message) => { sent.push(message); return send(message); }; }""")
+    record_changes(page)
     page.mouse.move(*window(page, -15, -15))
     page.mouse.down()
     page.mouse.move(*window(page, 10, 10))
@@ -150,7 +149,7 @@ def test_rectangle_drag_is_one_step(edit):
     page.mouse.up()
     wait(page)
 
-    final = [message["final"] for message in page.evaluate("sent") if message["do"] == "set"]
+    final = [message["final"] for message in page.evaluate("changes")]
     assert final == [False] * (len(final) - 1) + [True]
     assert len(final) > 1
     assert edits(page)[0]["outlines_um"] == [[[-15, -15], [15, -15], [15, 15], [-15, 15]]]

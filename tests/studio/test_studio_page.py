@@ -22,6 +22,7 @@ from studio.page_tools import (
     control,
     drop,
     has_picture,
+    record_changes,
     set_value,
     setting,
     settle,
@@ -271,8 +272,7 @@ def test_alternative_brings_its_parameters(visit):
 @pytest.mark.slow(keep=1)
 def test_slider_drag_is_one_step(visit):
     page = visit()
-    page.evaluate("() => { window.sent = []; const send = studio.connection.send.bind(studio.connection);"
-                  " studio.connection.send = (message) => { sent.push(message); return send(message); }; }")  # fmt: skip
+    record_changes(page)
     box = control(page, "optics.f_number", "input[type=range]").bounding_box()
     y = box["y"] + box["height"] / 2
     start = page.evaluate(
@@ -283,11 +283,9 @@ def test_slider_drag_is_one_step(visit):
     for k in range(1, 30):
         page.mouse.move(box["x"] + 6 + start * (box["width"] - 12) + 3 * k, y)
     page.mouse.up()
-    until(
-        page,
-        "() => studio.isReady && sent.length && sent[sent.length - 1].final && studio.connection.requests.doneId >= studio.connection.requests.lastId",
-    )
-    sent = page.evaluate("sent")
+    until(page, "() => changes.at(-1)?.final")
+    answered(page)
+    sent = page.evaluate("changes")
 
     assert [message["final"] for message in sent] == [False] * (len(sent) - 1) + [True]
     assert sent[-1]["value"] == setting(page, "optics.f_number") > 4.0
@@ -312,14 +310,10 @@ def test_slider_back_at_start_is_released(visit):
 
 def test_previews_wait_for_answers(visit):
     page = visit()
-    page.evaluate("""() => { window.sent = []; const { connection } = studio, send = connection.send.bind(connection);
-      connection.send = (message) => {
-        if (message.do === "set") sent.push({ ...message, ms: performance.now(), nDone: connection.requests.nDone });
-        return send(message);
-      };
-      for (let k = 0; k < 50; k++) connection.set("exposure_s", 0.01 + 0.001 * k, false); }""")
+    record_changes(page)
+    page.evaluate("() => { for (let k = 0; k < 50; k++) studio.connection.set('exposure_s', 0.01 + 0.001 * k, false); }")
     until(page, "() => studio.isReady && studio.state.settings.exposure_s > 0.0589")
-    first, second = page.evaluate("sent")
+    first, second = page.evaluate("changes")
 
     assert [round(message["value"], 6) for message in (first, second)] == [0.01, 0.059]
     assert second["nDone"] > first["nDone"] or second["ms"] >= first["ms"] + PATIENCE_MS - 1
