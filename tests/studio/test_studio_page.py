@@ -311,7 +311,9 @@ def test_slider_back_at_start_is_released(visit):
 def test_previews_wait_for_answers(visit):
     page = visit()
     record_changes(page)
-    page.evaluate("() => { for (let k = 0; k < 50; k++) studio.connection.set('exposure_s', 0.01 + 0.001 * k, false); }")
+    page.evaluate(
+        "() => { for (let k = 0; k < 50; k++) studio.connection.set('exposure_s', 0.01 + 0.001 * k, false); }"
+    )
     until(page, "() => studio.isReady && studio.state.settings.exposure_s > 0.0589")
     first, second = page.evaluate("changes")
 
