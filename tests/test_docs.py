@@ -92,6 +92,13 @@ def test_links_lead_to_pages():
     assert list(broken_links(ROOT)) == []
 
 
+@pytest.mark.parametrize("page", pages_of(ROOT), ids=lambda page: page.stem)
+def test_tables_have_header_rows(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    for table in re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE):
+        assert re.match(r"\|.*\n\|[\s:|-]+\n", table), table
+
+
 def test_all_pages_are_found():
     assert len(pages_of(ROOT)) >= 19
     assert len(PAGES) >= 13
