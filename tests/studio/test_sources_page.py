@@ -146,6 +146,37 @@ def test_video_plays_while_gaze_moves(visit, tmp_path):
     assert setting(page, "scene.picture") == "skimage:astronaut"
 
 
+def test_every_key_counts_during_frames(visit, tmp_path):
+    """Keys and buttons continue from the frame that is wanted, not from that of the last answer."""
+    page = visit()
+    drop(page, "clip.mp4", video(tmp_path))
+    film(page)
+    page.evaluate("""() => { window.shown = []; const { film } = studio.sources, { show } = film;
+      film.show = async (n, isFinal) => { shown.push(n); await new Promise((resolve) => { film.release = resolve; }); return show(n, isFinal); }; }""")
+
+    def release(n):
+        page.evaluate("() => studio.sources.film.release()")
+        until(page, "n => shown.length === n", n)
+
+    slider = page.locator("#film input[type=range]")
+    slider.press("ArrowRight")
+    slider.press("ArrowRight")
+    release(2)
+    assert slider.input_value() == "2"
+    slider.press("ArrowRight")
+    page.click("[aria-label='One frame forward']")
+    page.click("[aria-label='One frame forward']")
+    release(3)
+    page.click("[aria-label='One frame back']")
+    release(4)
+    page.evaluate("() => studio.sources.film.release()")
+    until(page, "() => studio.state.film.n === 4")
+    ready(page)
+
+    assert page.evaluate("shown") == [1, 2, 5, 4]
+    assert slider.input_value() == "4"
+
+
 def test_archive_of_frame_has_same_codes(visit, tmp_path):
     page = visit()
     drop(page, "clip.mp4", video(tmp_path))

@@ -13,7 +13,7 @@ from reference.accessibility import violations
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import Server, change, has_picture, set_value, setting, until
+from studio.page_tools import Server, change, has_picture, set_value, setting, settle, until
 
 from foveasim.config import build_shot, put_setting
 
@@ -26,6 +26,7 @@ IS_DONE = (
 
 def open_sweep(visit, **options):
     page = visit(accept_downloads=True, **options)
+    settle(page)
     page.click("[data-tile=sweep]")
     page.wait_for_selector("#tile-sweep select[aria-label=Result] option[value=snr]", state="attached")
     until(page, "() => studio.isReady")

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import Server, answered, change, set_value, setting, until
+from studio.page_tools import Server, answered, change, set_value, setting, settle, until
 
 pytestmark = pytest.mark.needs("chromium")
 
@@ -46,6 +46,7 @@ def test_hexagons_against_squares(tmp_path, visit):
     own = Server(tmp_path)
     try:
         page = visit(is_checked=False, address=own.address)
+        settle(page)
         page.click("[data-tile=variants]")
         for name, layout in (("squares", SQUARES), ("hexagons", HEXAGONS), ("fine hexagons", FINE)):
             set_value(page, "layout", layout)

@@ -27,32 +27,35 @@ export class Film {
     this.rate = new Rate();
   }
 
+  // The frame that is shown, or will be.
+  get target() { return this.wanted?.[0] ?? (this.isBusy ? this.next : this.n); }
+
   // Shows a frame; while another is computed, only the newest is shown next.
   /** @type {(n: number, isFinal?: boolean) => Promise<boolean>} */
   async go(n, isFinal = true) {
-    const to = Math.max(0, Math.min(this.count - 1, n));
-    if (this.isBusy) {
-      this.wanted = [to, isFinal];
-      return true;
-    }
+    this.wanted = [Math.max(0, Math.min(this.count - 1, n)), isFinal];
+    if (this.isBusy) return true;
     this.isBusy = true;
-    this.next = to;
-    const isShown = await this.show(to, isFinal).catch(() => false);
-    this.isBusy = false;
-    if (isShown) {
-      this.n = to;
-      this.rate.count();
-    } else this.isPlaying = false;
-    this.changed();
-    const next = this.wanted;
-    this.wanted = null;
-    return next ? this.go(...next) : isShown;
+    let isShown = false;
+    while (this.wanted) {
+      const [next, isLast] = this.wanted;
+      this.next = next;
+      this.wanted = null;
+      isShown = await this.show(next, isLast).catch(() => false);
+      if (isShown) {
+        this.n = next;
+        this.rate.count();
+      } else this.isPlaying = false;
+      this.isBusy = this.wanted !== null;
+      this.changed();
+    }
+    return isShown;
   }
 
   /** @param {number} by */
   step(by) {
     this.pause();
-    return this.go((this.wanted ? this.wanted[0] : this.n) + by);
+    return this.go(this.target + by);
   }
 
   // Plays at the rate of the file; frames are skipped when they take longer to compute.
@@ -85,7 +88,7 @@ export class Film {
     const wasPlaying = this.isPlaying;
     this.isPlaying = false;
     this.changed();
-    if (wasPlaying && this.settles && !this.wanted) this.go(this.isBusy ? this.next : this.n, true);
+    if (wasPlaying && this.settles && !this.wanted) this.go(this.target, true);
   }
 }
 
