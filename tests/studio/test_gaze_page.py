@@ -379,11 +379,8 @@ def test_path_survives_reload_and_restart(visit, server):
     until(page, "() => studio.gazePanel.rows.length === 3")
     server.stop()
     server.start()
-    page.evaluate("address => { location.hash = new URL(address).hash; location.reload(); }", server.address)
-    until(page, "() => window.studio && studio.state")
-    if page.is_visible("#restore"):
-        page.click("#restore")
-    until(page, "() => studio.gazePanel.rows.length === 3")
+    page.reload()
+    until(page, "() => window.studio?.state?.settings.gaze_path && studio.gazePanel.rows.length === 3")
     assert path_of(page) == ROWS
 
 
