@@ -38,12 +38,12 @@ export class Film {
     this.isBusy = true;
     let isShown = false;
     while (this.wanted) {
-      const [next, isLast] = this.wanted;
-      this.next = next;
+      const { wanted } = this;
+      this.next = wanted[0];
       this.wanted = null;
-      isShown = await this.show(next, isLast).catch(() => false);
+      isShown = await this.show(...wanted).catch(() => false);
       if (isShown) {
-        this.n = next;
+        this.n = this.next;
         this.rate.count();
       } else this.isPlaying = false;
       this.isBusy = this.wanted !== null;
