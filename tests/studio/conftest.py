@@ -134,11 +134,12 @@ def visit(server, browser):
             page.on("console", lambda message: problems.append(message.text))
         page.on("pageerror", lambda error: problems.append(str(error)))
         page.goto(address or server.address)
-        if options.get("bypass_csp", True) and address is None:
+        if options.get("bypass_csp", True) and address is None:  # otherwise the page refuses to poll conditions
             settle(page)
         return page
 
     yield open_page
     for context in contexts:
         context.close()
+    server.reset()
     assert problems == []

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import socket
 import threading
+import time
 
 import numpy as np
 import yaml
+from waiting import DEADLINE_S
 
 from foveasim.studio._server import Studio, host_names
 from foveasim.studio._session import Start
@@ -15,7 +18,7 @@ from foveasim.studio._session import Start
 #: WebGL by the processor, which every machine has.
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 TOKEN = "the-token-of-these-tests-0123456"
-TIMEOUT_MS = 60_000
+TIMEOUT_MS = 1000 * DEADLINE_S
 #: Whether an element, or the field of a label, has the focus (0), or follows what has it (1) or not (-1).
 DIRECTION = """(selector) => {
   const text = selector.startsWith("label=") ? selector.slice(6) : null, { activeElement } = document;
@@ -81,8 +84,15 @@ class Server:
 
     def stop(self):
         self.server.should_exit = self.server.force_exit = True
-        self.thread.join(20)
+        self.thread.join(DEADLINE_S)
         self.studio.close()
+
+    def reset(self):
+        """Forget the pages and the files of a test."""
+        with self.studio._opening:
+            self.studio.close()
+        shutil.rmtree(self.start_of.out)
+        self.start_of.out.mkdir()
 
     @property
     def address(self):
@@ -99,22 +109,14 @@ def until(page, condition, argument=None):
 
 
 def settle(page):
-    """Wait until all parts that the page asked for are drawn."""
-    until(
-        page,
-        "() => window.studio && studio.isReady && studio.views.parts.picture && studio.connection.requests.nDone > 0",
-    )
-
-
-def answered(page):
-    """Wait until the page shows the answer to its last message."""
-    until(page, "() => studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId")
+    """Wait until nothing more changes without the user: all answers, files and frames are there."""
+    until(page, "() => window.studio?.isIdle")
 
 
 def change(page, script, argument=None):
     """Run a script that sends messages, and wait for the answer to the last one."""
     page.evaluate(script, argument)
-    answered(page)
+    settle(page)
 
 
 def set_value(page, key, value):
@@ -128,6 +130,37 @@ def record_changes(page):
         if (message.do === "set") changes.push({ ...message, ms: performance.now(), nDone: connection.requests.nDone });
         return send(message);
       }; }""")
+
+
+def hold_clock(page):
+    """Stop the clock that recordings and films read; ``pass_time`` moves it."""
+    page.evaluate(
+        "() => { const now = performance.now(); window.passedMs = 0; performance.now = () => now + passedMs; }"
+    )
+
+
+def pass_time(page, time_ms):
+    page.evaluate("time => { passedMs += time; }", time_ms)
+
+
+def type_ahead(page, text, words=itertools.count(1)):  # noqa: B008
+    """Type the first letters of an option of the selection with the focus, which the browser takes for one word, however late."""
+    session, start_s = page.context.new_cdp_session(page), time.time() + 10.0 * next(words)
+    for k, letter in enumerate(text):
+        key = {"key": letter, "timestamp": start_s + 0.01 * k}
+        session.send("Input.dispatchKeyEvent", {"type": "keyDown", "text": letter, **key})
+        session.send("Input.dispatchKeyEvent", {"type": "keyUp", **key})
+    session.detach()
+
+
+def forget_notice(page):
+    """Remove the last notice, so that the same one can be awaited again."""
+    page.evaluate("() => { document.getElementById('notice').textContent = ''; }")
+
+
+def noticed(page, text):
+    """Wait for a notice, which the page may have hidden since."""
+    until(page, "text => document.getElementById('notice').textContent.includes(text)", text)
 
 
 def setting(page, key):
@@ -204,14 +237,10 @@ class Keys:
     def choose(self, selector, label):
         """Select an option by the first letters of its label."""
         self.to(selector)
-        for _ in range(5):
-            self.page.keyboard.type(label)
-            self.wait()
-            chosen = self.page.evaluate("() => document.activeElement.selectedOptions[0].label")
-            if chosen.startswith(label):
-                return
-            self.page.wait_for_timeout(1500)  # the browser took letters that came late for those of another label
-        raise AssertionError(f"{selector}: {chosen} instead of {label}")
+        type_ahead(self.page, label)
+        self.wait()
+        chosen = self.page.evaluate("() => document.activeElement.selectedOptions[0].label")
+        assert chosen.startswith(label), f"{selector}: {chosen} instead of {label}"
 
     def set(self, key, text):
         """Enter the value of a control."""
@@ -251,8 +280,8 @@ class Keys:
         return path
 
     def wait(self):
-        """Wait until the page shows the answer to the last key."""
-        answered(self.page)
+        """Wait until the page shows the result of the last key."""
+        settle(self.page)
 
     @property
     def n_pointed(self):

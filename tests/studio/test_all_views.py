@@ -153,10 +153,10 @@ def test_all_views_show_their_data(visit):
     page.evaluate(OPEN_ALL)
     settle(page)
     page.click("#freeze")
-    until(page, "() => studio.isReady && studio.views.parts.comparison && !studio.solid.isAsked")
+    until(page, "() => studio.isIdle && studio.views.parts.comparison && !studio.solid.isAsked")
     before = page.evaluate(TILES)
     change(page, SET_ALL, OTHER)
-    until(page, "() => studio.isReady && !studio.solid.isAsked")
+    until(page, "() => studio.isIdle && !studio.solid.isAsked")
     later = page.evaluate(TILES)
     problems = {name: problem_of_tile(content, later[name]) for name, content in before.items()}
 
@@ -221,7 +221,7 @@ def test_wrong_content_of_tiles_is_found(visit, monkeypatch, script, problem):
     page = visit()
     page.route("**/views/wrong.js", lambda route: route.fulfill(body=module, content_type="text/javascript"))
     page.evaluate("() => studio.views.show('wrong', true)")
-    until(page, "() => studio.isReady && studio.views.parts.wrong && studio.views.made.wrong")
+    until(page, "() => studio.isIdle && studio.views.parts.wrong && studio.views.made.wrong")
     settle(page)
     before = page.evaluate(TILES)
     set_value(page, "exposure_s", 0.03)
@@ -248,7 +248,7 @@ def test_documented_view_shows_brightest_sites(visit, monkeypatch):
     page = visit()
     page.route("**/views/brightest.js", lambda route: route.fulfill(body=script, content_type="text/javascript"))
     page.click("#tabs [data-tile=brightest]")
-    until(page, "() => studio.isReady && studio.views.parts.brightest")
+    until(page, "() => studio.isIdle && studio.views.parts.brightest")
     codes = page.evaluate("() => [...studio.panes.b.columns.find((c) => c.key === 'code').values]")
     shown = page.locator("#tile-brightest li").all_inner_texts()
 

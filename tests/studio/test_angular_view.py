@@ -87,7 +87,7 @@ def test_tile_and_map_show_angular_response(visit):
     page.click("[data-tile='angular']")
     until(page, "() => studio.views.made.angular?.chart.curves.length > 0")
     page.select_option("#colouring", "angular_response")
-    until(page, "() => studio.isReady && studio.panes.b.column?.key === 'angular_response'")
+    until(page, "() => studio.isIdle && studio.panes.b.column?.key === 'angular_response'")
     low, high = page.evaluate(
         "() => { const { values } = studio.panes.b.column; return [Math.min(...values), Math.max(...values)]; }"
     )

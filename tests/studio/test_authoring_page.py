@@ -69,14 +69,6 @@ def drag(page, start, end, *, steps=4):
     page.mouse.up()
 
 
-def wait(page):
-    """Wait until the last edit is drawn."""
-    until(
-        page,
-        "() => studio.isReady && !studio.editor.pending && studio.connection.requests.doneId >= studio.connection.requests.lastId",
-    )
-
-
 def edits(page):
     return setting(page, "layout.edits") or []
 
@@ -108,7 +100,7 @@ def test_drawn_polygon_is_in_geojson(edit):
     corners = [(-15.0, -15.0), (30.0, -15.0), (30.0, 15.0), (0.0, 30.0)]
     click(page, *corners)
     page.keyboard.press("Enter")
-    wait(page)
+    settle(page)
 
     assert edits(page) == [{"kind": "draw", "outlines_um": [[list(c) for c in corners]], "overlap": "cut"}]
     rings = [np.array(f["geometry"]["coordinates"][0]) for f in download(page, "geojson")["features"]]
@@ -123,7 +115,7 @@ def test_drawn_polygon_is_in_geojson(edit):
 def test_first_vertex_closes_polygon(edit):
     page = edit("polygon")
     click(page, (0, 0), (40, 0), (40, 40), (20, 60), (0, 0))
-    wait(page)
+    settle(page)
 
     assert len(edits(page)[0]["outlines_um"][0]) == 4
     click(page, (-60, -60), (-40, -60), (-40, -40), (-50, -30))
@@ -131,7 +123,7 @@ def test_first_vertex_closes_polygon(edit):
     page.keyboard.press("Control+z")
     until(page, "() => studio.editor.tool.path.length === 2")
     page.keyboard.press("Escape")
-    wait(page)
+    settle(page)
     assert len(edits(page)) == 1
     assert page.evaluate("studio.editor.tool.path.length") == 0
     page.mouse.dblclick(*window(page, -80, -80))
@@ -147,7 +139,7 @@ def test_rectangle_drag_is_one_step(edit):
     until(page, "() => studio.panes.b.sites.n !== 120")
     page.mouse.move(*window(page, 15, 15))
     page.mouse.up()
-    wait(page)
+    settle(page)
 
     final = [message["final"] for message in page.evaluate("changes")]
     assert final == [False] * (len(final) - 1) + [True]
@@ -167,7 +159,7 @@ def test_cancelled_drag_restores_layout(edit):
     until(page, "() => studio.panes.b.sites.n !== 120")
     page.keyboard.press("Escape")
     page.mouse.up()
-    wait(page)
+    settle(page)
 
     assert edits(page) == []
     assert count(page) == N_SITES
@@ -180,7 +172,7 @@ def test_invalid_polygon_keeps_last_state(edit):
     click(page, (-30, -30), (30, 30), (30, -30), (-30, 30))
     page.keyboard.press("Enter")
     page.wait_for_selector(".tool-problem:not([hidden])")
-    wait(page)
+    settle(page)
 
     assert page.inner_text(".tool-problem").strip()
     assert edits(page) == []
@@ -189,7 +181,7 @@ def test_invalid_polygon_keeps_last_state(edit):
     page.keyboard.press("Escape")
     click(page, (-30, -30), (30, -30), (30, 30))
     page.keyboard.press("Enter")
-    wait(page)
+    settle(page)
     assert page.is_hidden(".tool-problem")
     assert len(edits(page)) == 1
 
@@ -200,7 +192,7 @@ def test_invalid_polygon_keeps_last_state(edit):
 def test_shared_vertex_moves_in_all_sites(edit):
     page = edit("vertex")
     drag(page, (20, 20), (25, 30))
-    wait(page)
+    settle(page)
 
     assert edits(page) == [{"kind": "move_vertices", "from_um": [[20, 20]], "to_um": [[25, 30]]}]
     found = areas(page)
@@ -216,20 +208,20 @@ def test_shared_vertex_moves_in_all_sites(edit):
 def test_edge_gets_vertex_that_is_removed(edit):
     page = edit("vertex")
     drag(page, (10, 0), (10, 5))
-    wait(page)
+    settle(page)
     assert edits(page)[0] == {"kind": "move_vertices", "from_um": [[10, 0]], "to_um": [[10, 5]]}
     found = areas(page)
     assert sorted(found[np.abs(found - 400) > 1e-6]) == pytest.approx([350.0, 450.0])
     page.mouse.move(*window(page, 10, 5))
     page.keyboard.press("Delete")
-    wait(page)
+    settle(page)
 
     assert edits(page)[1] == {"kind": "remove_vertices", "points_um": [[10, 5]]}
     assert np.allclose(areas(page), 400.0)
     page.keyboard.down("Alt")
     click(page, (-40, 40))
     page.keyboard.up("Alt")
-    wait(page)
+    settle(page)
     assert edits(page)[2] == {"kind": "remove_vertices", "points_um": [[-40, 40]]}
 
 
@@ -237,7 +229,7 @@ def test_inset_disables_vertex_tool(edit):
     page = edit("vertex", layout={"inset_um": 1.0})
     assert "inset of 1 µm" in page.inner_text(".tool-hint")
     drag(page, (19, 19), (25, 30))
-    wait(page)
+    settle(page)
     assert edits(page) == []
     use(page, "polygon")
     assert "inset of 1 µm" in page.inner_text(".tool-hint")
@@ -247,7 +239,7 @@ def test_merge_joins_clicked_sites(edit):
     page = edit("merge")
     click(page, (10, 10), (30, 10))
     page.keyboard.press("Enter")
-    wait(page)
+    settle(page)
 
     assert edits(page) == [{"kind": "merge_at", "points_um": [[10, 10], [30, 10]]}]
     assert count(page) == N_SITES - 1
@@ -259,7 +251,7 @@ def test_cut_follows_line(edit):
     page = edit("cut")
     click(page, (-20, 0), (0, 20))
     page.keyboard.press("Enter")
-    wait(page)
+    settle(page)
     assert count(page) == N_SITES + 1
     assert np.sort(areas(page))[:2] == pytest.approx([200.0, 200.0])
     use(page, "select")
@@ -267,7 +259,7 @@ def test_cut_follows_line(edit):
     use(page, "cut")
     click(page, (20, 50), (100, 50))
     page.click(".apply")
-    wait(page)
+    settle(page)
 
     assert edits(page)[1]["points_um"] == [[50, 50]]
     assert count(page) == N_SITES + 2
@@ -283,7 +275,7 @@ def test_selection_is_split_coloured_and_deleted(edit):
     use(page, "channel")
     page.get_by_label("Filter", exact=True).select_option(label="filter B")
     page.click(".apply")
-    wait(page)
+    settle(page)
     assert page.evaluate(
         "(() => { const { values } = studio.panes.b.columns.find((c) => c.key === 'channel'); return studio.page.selected.map((site) => values[site]); })()"
     ) == [2, 2]
@@ -291,12 +283,12 @@ def test_selection_is_split_coloured_and_deleted(edit):
     page.get_by_label("Parts along x").fill("3")
     page.get_by_label("Parts along y").fill("2")
     page.click(".apply")
-    wait(page)
+    settle(page)
     assert count(page) == N_SITES + 2 * 5
     use(page, "select")
     click(page, (-10, -10))
     page.keyboard.press("Delete")
-    wait(page)
+    settle(page)
 
     assert count(page) == N_SITES + 2 * 5 - 1
     assert [each["kind"] for each in edits(page)] == ["set_channel", "split_at", "remove_at"]
@@ -310,7 +302,7 @@ def test_moved_selection_stays_selected(edit):
     page.keyboard.up("Shift")
     use(page, "move")
     drag(page, (110, 10), (145, 20))
-    wait(page)
+    settle(page)
 
     assert edits(page)[0]["by_um"] == [35, 10]
     assert page.evaluate("studio.page.selected.map((site) => studio.panes.b.sites.centre(site))") == pytest.approx(
@@ -319,7 +311,7 @@ def test_moved_selection_stays_selected(edit):
     page.focus("#map .marks")
     for key in ("ArrowRight", "ArrowRight", "ArrowUp"):
         page.keyboard.press(key)
-        wait(page)
+        settle(page)
     step = page.evaluate("studio.editor.step")
     assert [each["by_um"] for each in edits(page)] == [[35, 10], [2 * step, step]]
     undo(page)
@@ -336,7 +328,7 @@ def test_layer_is_placed_in_the_view(edit):
     page = edit("layer")
     page.locator(".tool-options").get_by_label("Generator").select_option(label="hexagonal")
     page.click(".apply")
-    wait(page)
+    settle(page)
     (added,) = edits(page)
     assert added["layer"]["generator"] == "hexagonal"
     assert added["layer"]["move_um"] == [0, 0]
@@ -345,12 +337,12 @@ def test_layer_is_placed_in_the_view(edit):
         field = page.locator(f".step-fields [data-at$='.{name}']")
         field.fill(value)
         field.press("Enter")
-        wait(page)
+        settle(page)
 
     assert edits(page)[0]["layer"]["parameters"] == {"n_columns": 4, "n_rows": 4, "pitch_um": 10}
     assert (areas(page) < 100).sum() >= 16
     page.locator(".step-fields select").select_option("cut_out")
-    wait(page)
+    settle(page)
     assert areas(page).sum() == pytest.approx(N_SITES * 400 - 16 * 100 * np.sqrt(3) / 2)
 
 
@@ -360,7 +352,7 @@ def test_layer_is_placed_in_the_view(edit):
 def test_rules_follow_drag_and_repair(edit):
     page = edit("rectangle")
     page.click(".rules-button")
-    wait(page)
+    settle(page)
     assert setting(page, "layout.rules.min_size_um") == 20
     until(page, "() => document.querySelector('.rules-button').textContent === 'rules satisfied'")
     page.mouse.move(*window(page, -35, -35))
@@ -369,10 +361,10 @@ def test_rules_follow_drag_and_repair(edit):
     until(page, "() => /violation/.test(document.querySelector('.rules-button').textContent)")
     assert page.evaluate("studio.editor.violationsIn([-180, 280, -150, 310]).length") > 0
     page.mouse.up()
-    wait(page)
+    settle(page)
     assert page.evaluate("studio.rules.violations.n") > 0
     use(page, "repair")
-    wait(page)
+    settle(page)
 
     until(page, "() => document.querySelector('.rules-button').textContent === 'rules satisfied'")
     assert edits(page)[-1] == {"kind": "repair"}
@@ -391,7 +383,7 @@ def test_hundred_edits_undo_and_redo(edit):
           studio.editor.commit({ kind: "split_at", points_um: [[x, y]], n_x: 2, n_y: 1 });
         } }""",
     )
-    wait(page)
+    settle(page)
     assert len(edits(page)) == 100
     last = areas(page)
     assert len(last) == N_SITES + 100
@@ -407,7 +399,7 @@ def test_steps_are_listed_and_changed(edit):
     page = edit()
     page.evaluate("""() => { studio.editor.commit({ kind: "split_at", points_um: [[10, 10]], n_x: 2, n_y: 2 });
       studio.editor.commit({ kind: "remove_at", points_um: [[-110, -90]] }); }""")
-    wait(page)
+    settle(page)
     names = "[...document.querySelectorAll('.step-name')].map((e) => e.innerText.replace(/\\s+/g, ' '))"
     assert page.evaluate(names) == ["1. Split 1 site into 2 × 2", "2. Delete 1 site"]
     page.locator(".step-name").first.click()
@@ -421,21 +413,21 @@ def test_steps_are_listed_and_changed(edit):
     field = page.locator(".step-fields [data-at='field0n_x']")
     field.fill("5")
     field.press("Enter")
-    wait(page)
+    settle(page)
     assert edits(page)[0]["n_x"] == 5
     assert count(page) == N_SITES + 9 - 1
     page.click("[aria-label='Move down: step 1']")
-    wait(page)
+    settle(page)
     assert [each["kind"] for each in edits(page)] == ["remove_at", "split_at"]
     page.click("[aria-label='Delete: step 1']")
-    wait(page)
+    settle(page)
     assert count(page) == N_SITES + 9
     page.click("[aria-label='Duplicate: step 1']")
-    wait(page)
+    settle(page)
     assert len(edits(page)) == 2
     page.locator(".step-name").last.focus()
     page.keyboard.press("Delete")
-    wait(page)
+    settle(page)
     assert len(edits(page)) == 1
 
 
@@ -491,7 +483,7 @@ def test_grid_of_settings_is_the_step(edit):
     assert page.evaluate("studio.editor.step") == 0.25
     use(page, "vertex")
     drag(page, (20, 20), (25, 30))
-    wait(page)
+    settle(page)
     assert edits(page)[0]["tolerance_um"] > 0.25 / np.sqrt(2)
     assert areas(page).sum() == pytest.approx(N_SITES * PITCH_UM**2)
 
@@ -507,7 +499,7 @@ def test_keyboard_alone_draws_and_moves(edit):
     for key in ("ArrowRight", "ArrowRight", "ArrowUp"):
         page.keyboard.press(key)
     page.keyboard.press("Enter")
-    wait(page)
+    settle(page)
     assert edits(page)[0]["outlines_um"] == [[[0, 0], [20, 0], [20, 10], [0, 10]]]
     page.keyboard.press("n")
     page.keyboard.press("ArrowUp")  # the next vertex above
@@ -516,7 +508,7 @@ def test_keyboard_alone_draws_and_moves(edit):
     page.keyboard.press("Enter")
     page.keyboard.press("ArrowLeft")
     page.keyboard.press("Enter")
-    wait(page)
+    settle(page)
     assert edits(page)[1]["kind"] == "move_vertices"
     page.keyboard.press("p")
     field = page.get_by_label("Position in µm")
@@ -525,7 +517,7 @@ def test_keyboard_alone_draws_and_moves(edit):
         field.press("Enter")
     field.press("Enter")
     until(page, "() => (studio.state.settings.layout.edits || []).length === 3")
-    wait(page)
+    settle(page)
 
     assert edits(page)[2]["outlines_um"] == [[[-100, -100], [-90, -100], [-90, -89.5]]]
     page.keyboard.press("Escape")
@@ -543,7 +535,7 @@ def test_typed_positions_replace_each_other(edit):
         page.keyboard.press("Enter")
         until(page, "() => studio.page.asked === null")  # the page has written the position that was placed
     page.keyboard.press("Enter")
-    wait(page)
+    settle(page)
 
     assert edits(page)[0]["outlines_um"] == [[[-100, -100], [-90, -100], [-90, -89.5]]]
 
@@ -564,7 +556,7 @@ def test_drawn_settings_match_command(edit, tmp_path):
 
     page = edit("rectangle")
     drag(page, (-30, -30), (10, 10))
-    wait(page)
+    settle(page)
     set_value(page, "exposure_s", 0.01)
     path = tmp_path / "shot.yaml"
     page.click("#file")
@@ -582,7 +574,7 @@ def test_layer_in_rectangle_keeps_the_rest(edit):
     page = edit("layer")
     page.locator(".tool-options").get_by_label("Generator").select_option(label="grid")
     drag(page, (10.0, 10.0), (50.0, 30.0))
-    wait(page)
+    settle(page)
     (added,) = edits(page)
 
     assert added["region"] == [[10, 10], [50, 10], [50, 30], [10, 30]]
@@ -591,7 +583,7 @@ def test_layer_in_rectangle_keeps_the_rest(edit):
     undo(page)
     page.evaluate("() => studio.editor.use('layer')")
     click(page, (30.0, 20.0))
-    wait(page)
+    settle(page)
     (added,) = edits(page)
     assert "region" not in added
     assert added["layer"]["move_um"] == [30, 20]

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import csv
-import time
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 from PIL import Image
+from waiting import DEADLINE_S, wait_until
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import TOKEN, Server, answered, change, codes, control, set_value, setting, settle, until
+from studio.page_tools import (
+    TOKEN,
+    Server,
+    change,
+    codes,
+    control,
+    forget_notice,
+    noticed,
+    set_value,
+    setting,
+    settle,
+    until,
+)
 
 from foveasim.studio._session import Session
 
@@ -28,7 +40,7 @@ def field(page, key, value):
     box = control(page, key)
     box.fill(value)
     box.press("Enter")
-    answered(page)
+    settle(page)
 
 
 # -- problems -----------------------------------------------------------------------------------------------------------
@@ -149,7 +161,7 @@ def test_number_of_photosites_is_entered(visit):
     )
 
     solve.select_option(label="min size")
-    until(page, "() => studio.isReady && !('min_size_um' in studio.state.settings.layout.parameters)")
+    until(page, "() => studio.isIdle && !('min_size_um' in studio.state.settings.layout.parameters)")
     assert page.evaluate("studio.state.summary.n_sites") == pytest.approx(5000, rel=0.02)
     for _ in range(2):
         change(page, "() => document.getElementById('undo').click()")
@@ -206,7 +218,7 @@ def test_silent_server_is_not_shown_as_ready(visit, server):
         until(page, "() => document.body.classList.contains('silent')")
         assert page.inner_text("#status") == "waiting for the server…"
         assert setting(page, "optics.f_number") == 2.8
-    until(page, "() => studio.isReady && studio.state.settings.optics.f_number === 4")
+    until(page, "() => studio.isIdle && studio.state.settings.optics.f_number === 4")
     assert not page.evaluate("document.body.classList.contains('silent')")
 
 
@@ -220,14 +232,14 @@ def test_change_of_a_broken_connection_is_repeated(browser, tmp_path, visit):
         session._is_closed = True  # messages are accepted, and not answered
         with session._wake:
             session._wake.notify_all()
-        session._thread.join(20)
+        session._thread.join(DEADLINE_S)
         control(page, "optics.f_number").fill("4")
         control(page, "optics.f_number").press("Enter")
         until(page, "() => studio.connection.unanswered.size === 1")
         own.stop()
         until(page, "() => document.body.classList.contains('offline')")
         own.start()
-        until(page, "() => studio.isReady && studio.state.settings.optics.f_number === 4")
+        until(page, "() => studio.isIdle && studio.state.settings.optics.f_number === 4")
         assert control(page, "optics.f_number").input_value() == "4"
     finally:
         own.stop()
@@ -239,19 +251,19 @@ def test_long_work_is_cancelled(visit, server, monkeypatch):
     check = Session._check
 
     def slow(session, stage):
-        time.sleep(0.5)
+        wait_until(lambda: session._is_cancelled)
         check(session, stage)
 
     monkeypatch.setattr(Session, "_check", slow)
-    for session in server.studio.sessions.values():
-        monkeypatch.setattr(session.engine._runner, "check", session._check)
+    session = server.studio.sessions[page.evaluate("sessionStorage.getItem('foveasim-studio-session')")]
+    monkeypatch.setattr(session.engine._runner, "check", session._check)
     field_of = control(page, "layout.parameters.n_sectors")
     field_of.fill("64")
     field_of.press("Enter")
     page.wait_for_selector("#cancel:not([hidden])")
     assert "…" in page.inner_text("#status")
     page.click("#cancel")
-    until(page, "() => studio.isReady && document.getElementById('notice').textContent.includes('cancelled')")
+    until(page, "() => studio.isIdle && document.getElementById('notice').textContent.includes('cancelled')")
     monkeypatch.undo()
 
     assert setting(page, "layout.parameters.n_sectors") == 48
@@ -277,21 +289,19 @@ def test_save_asks_before_it_replaces(browser, tmp_path, visit):
 
         save("Fovéa 網膜")
         path = tmp_path / "Fovéa_網膜.yaml"
-        until(page, "() => document.getElementById('notice').textContent.startsWith('Saved')")
+        noticed(page, "Saved")
         first = path.read_text()
         set_value(page, "exposure_s", 0.005)
         save("Fovéa 網膜")
         page.wait_for_selector("#confirm-dialog[open]")
         assert page.inner_text("#confirm-title") == "Fovéa_網膜.yaml exists. Replace it?"
         page.click("#confirm-dialog button[value='']")
-        assert path.read_text() == first
         save("Fovéa 網膜")
+        page.wait_for_selector("#confirm-dialog[open]")  # a message that replaces the file would have come before
+        assert path.read_text() == first
+        forget_notice(page)
         page.click("#confirm-verb")
-        until(page, "() => document.getElementById('notice').textContent.startsWith('Saved')")
-        for _ in range(100):
-            if path.read_text() != first:
-                break
-            time.sleep(0.05)
+        noticed(page, "Saved")
         assert "exposure_s: 0.005" in path.read_text()
         assert TOKEN not in path.read_text()
     finally:
@@ -429,7 +439,7 @@ def test_charts_compare_pinned_photosites(visit):
     page.keyboard.down("Shift")
     page.mouse.click(x, y)  # ... against periphery
     page.keyboard.up("Shift")
-    until(page, "() => studio.isReady && studio.page.kept.length === 2")
+    until(page, "() => studio.isIdle && studio.page.kept.length === 2")
     names = ["photosite 0", f"photosite {last:,}"]
     until(page, "() => ['photon_transfer', 'snr'].every((name) => studio.views.made[name].chart.curves.length === 2)")
     until(page, "() => studio.views.made.mtf.chart.curves.length === 3")
@@ -441,7 +451,7 @@ def test_charts_compare_pinned_photosites(visit):
     set_value(page, "optics.f_number", 4.0)
     assert labels(page, "snr") == names
     page.keyboard.press("Escape")
-    until(page, "() => studio.isReady && studio.views.made.photon_transfer.chart.curves.length > 2")
+    until(page, "() => studio.isIdle && studio.views.made.photon_transfer.chart.curves.length > 2")
     until(page, "() => studio.views.made.snr.chart.curves.length > 2 && studio.views.made.mtf.chart.curves.length > 3")
     assert {name: labels(page, name) for name in typical} == typical
 
@@ -452,10 +462,10 @@ def test_photosites_are_kept_by_keyboard(visit):
     button = page.locator("#compare-site")
     button.focus()
     page.keyboard.press("Enter")
-    until(page, "() => studio.isReady && studio.page.kept.length === 1")
+    until(page, "() => studio.isIdle && studio.page.kept.length === 1")
     assert button.get_attribute("aria-pressed") == "true"
     page.keyboard.press("Enter")
-    until(page, "() => studio.isReady && studio.page.kept.length === 0")
+    until(page, "() => studio.isIdle && studio.page.kept.length === 0")
 
 
 @pytest.mark.slow(keep=1)

@@ -13,8 +13,8 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
 from reference.accessibility import violations
-from studio.page_tools import Keys, change, codes, drop, set_value, setting, settle, until
-from studio.test_sources_page import film, ready, video
+from studio.page_tools import Keys, change, codes, drop, hold_clock, pass_time, set_value, setting, settle, until
+from studio.test_sources_page import film, hold_frames, video
 
 from foveasim.config import read_shot
 from foveasim.video import GazePath, read_recording
@@ -30,15 +30,6 @@ RECORD, TABLE = "#gaze .record", "#gaze [aria-label='Show the rows of the gaze p
 FRAME_S = 0.1
 RECORDED = {0: [0.0, 0.0], 2: [60.0, 20.0], 5: [-40.0, 35.0], 9: [25.0, -30.0]}
 ROWS = [[0.0, -140.0, 320.0], [0.2, 60.0, 120.0], [0.4, -200.0, 100.0]]
-
-
-def at_rest(page):
-    """Wait until the path is not played, and everything is answered."""
-    until(
-        page,
-        "() => studio.isReady && !studio.gazePanel.film?.isPlaying && !studio.gazePanel.film?.isBusy && studio.connection.requests.waiting.length === 0"
-        " && studio.connection.requests.doneId >= studio.connection.requests.lastId",
-    )
 
 
 def gaze(page):
@@ -61,15 +52,15 @@ def steps(page):
 
 
 def drag(page, by, n_moves=4):
-    """Drag the outline by CSS pixels."""
+    """Drag the outline by CSS pixels, with a held clock."""
     x, y = page.evaluate("() => studio.toWindow(0, 0, 'scene')")
     page.mouse.move(x + 6, y + 12)
     page.mouse.down()
     for k in range(1, n_moves + 1):
         page.mouse.move(x + 6 + by[0] * k / n_moves, y + 12 + by[1] * k / n_moves)
-        page.wait_for_timeout(60)
+        pass_time(page, 60)
     page.mouse.up()
-    at_rest(page)
+    settle(page)
 
 
 def interpolated(rows, t_s):
@@ -89,23 +80,24 @@ def test_recording_over_picture_is_one_step(visit):
     page = visit()
     start = gaze(page)
     page.click("#gaze-path")
+    hold_clock(page)
     page.click(RECORD)
-    page.wait_for_timeout(300)
+    pass_time(page, 300)
     drag(page, (30, -12))
-    page.wait_for_timeout(300)
+    pass_time(page, 300)
     drag(page, (-20, 10))
     page.click(RECORD)
-    at_rest(page)
+    settle(page)
     rows = path_of(page)
-    times, end = [row[0] for row in rows], gaze(page)
+    moved_ms = [300, 360, 420, 480, 540, 840, 900, 960, 1020, 1080]
+    expected = {round(30e-3 * ms) for ms in moved_ms}
+    # The rest before a movement is recorded too.
+    expected |= {0} | {k - 1 for k in expected}
 
     assert rows[0] == [0, *start]
-    assert times == sorted(set(times))
-    assert 0.6 < times[-1] < 30.0
-    assert rows[-1][1:] == end != start
-    np.testing.assert_allclose(np.array(times) * 30, np.round(np.array(times) * 30), atol=1e-9)
+    np.testing.assert_allclose([30 * t for t, *_ in rows], sorted(expected), atol=1e-9)
+    assert rows[-1][1:] == gaze(page) != start
     assert steps(page) == 1
-    # The rest before a movement is recorded too.
     assert rows[1][1:] == pytest.approx(start)
     change(page, "() => { studio.connection.send({ do: 'undo' }); }")
     assert (gaze(page), path_of(page)) == (start, None)
@@ -136,20 +128,20 @@ def test_recorded_video_runs_on_command_line(visit, server, tmp_path):
     for n, (x, y) in RECORDED.items():
         page.evaluate("n => studio.sources.film.go(n)", n)
         until(page, "n => studio.state.film.n === n", n)
-        ready(page)
+        settle(page)
         page.evaluate(
             "([x, y]) => { const [a, b] = studio.gazePanel.recordedAt; studio.panes.scene.on.gaze(x - a, y - b, true); }",
             [x, y],
         )
-        at_rest(page)
+        settle(page)
     page.click(RECORD)
-    at_rest(page)
+    settle(page)
     rows = path_of(page)
     expected = [[n * FRAME_S, *RECORDED[n]] for n in RECORDED if n > 0]
     np.testing.assert_allclose([row for row in rows if row[0] > 0.0], expected, atol=1e-9)
 
     page.evaluate("() => studio.gazePanel.film.go(0)")
-    at_rest(page)
+    settle(page)
     # Replay: each state has the gaze of its frame.
     page.evaluate(
         """() => { window.shown = []; const { usePath, use } = studio.gazePanel;
@@ -157,7 +149,7 @@ def test_recorded_video_runs_on_command_line(visit, server, tmp_path):
     )
     page.click("[aria-label='Play the gaze path']")
     until(page, "() => !studio.gazePanel.film.isPlaying && studio.state.film.n === 11")
-    at_rest(page)
+    settle(page)
     shown = page.evaluate("shown")
     # A slow machine skips frames.
     assert len({n for n, *_ in shown}) > 1
@@ -169,7 +161,7 @@ def test_recorded_video_runs_on_command_line(visit, server, tmp_path):
     for n in (3, 5, 11):
         page.evaluate("n => studio.gazePanel.film.go(n)", n)
         until(page, "n => studio.state.film.n === n", n)
-        at_rest(page)
+        settle(page)
         found[n] = codes(page)
 
     name = f"{tmp_path.name}.yaml"
@@ -192,32 +184,35 @@ def test_gaze_follows_pointer_while_video_plays(visit, tmp_path):
     page.click("#gaze-path")
     page.click(RECORD)
     x, y = page.evaluate("() => studio.toWindow(0, 0, 'scene')")
-    page.evaluate("() => { studio.sources.film.play(); }")
+    hold_frames(page)
+    page.evaluate("() => { studio.sources.film.isSkipping = false; studio.sources.film.play(); }")
     page.mouse.move(x, y)
     page.mouse.down()
-    for k in range(12):
-        page.mouse.move(x + 3 * k, y - 2 * k)
-        page.wait_for_timeout(80)
-    until(page, "() => studio.state.film.n >= 3")
+    for k in range(1, 5):
+        page.mouse.move(x + 6 * k, y - 4 * k)
+        until(page, "k => shown.length === k", k)
+        page.evaluate("() => release()")
+        until(page, "k => studio.state.film.n === k", k)
     page.mouse.up()
-    page.evaluate("() => studio.sources.film.pause()")
-    ready(page)
+    page.evaluate("() => { studio.sources.film.pause(); releaseAll(); }")
+    settle(page)
     page.click(RECORD)
-    at_rest(page)
+    settle(page)
     rows = path_of(page)
-    frames = np.array([row[0] for row in rows]) / FRAME_S
+    positions = np.array(rows)[:, 1:]
 
-    assert len(rows) >= 3
-    np.testing.assert_allclose(frames, np.round(frames), atol=1e-9)
-    assert len(set(map(tuple, np.round(np.array(rows)[:, 1:], 3).tolist()))) >= 3
+    np.testing.assert_allclose([t / FRAME_S for t, *_ in rows], range(5), atol=1e-9)
+    # Frame k came after movement k, and before the next one.
+    assert (np.diff(positions[:4], axis=0) > 0.1).all()
+    np.testing.assert_array_equal(positions[4], positions[3])
     # Another recording replaces the rows of its frames only.
     page.evaluate("() => studio.sources.film.go(13)")
     until(page, "() => studio.state.film.n === 13")
-    ready(page)
+    settle(page)
     page.click(RECORD)
     page.evaluate("() => studio.panes.scene.on.gaze(5, 5, true)")
     page.click(RECORD)
-    at_rest(page)
+    settle(page)
     assert path_of(page)[:-1] == [row for row in rows if row[0] < 1.25]
     assert path_of(page)[-1][0] == pytest.approx(1.3)
 
@@ -235,7 +230,7 @@ def test_replay_over_picture_follows_the_path(visit):
     )
     page.click("[aria-label='Play the gaze path']")
     until(page, "() => !studio.gazePanel.film.isPlaying && studio.gazePanel.film.n > 0")
-    at_rest(page)
+    settle(page)
     shown = page.evaluate("shown")
 
     np.testing.assert_allclose([xy for _, *xy in shown], [interpolated(ROWS, t) for t, *_ in shown], atol=1e-9)
@@ -247,15 +242,15 @@ def test_replay_over_picture_follows_the_path(visit):
 
 def test_pause_keeps_the_last_position(visit):
     page = visit()
-    with_rows(page, [[0, 0, 0], [20, 400, 0]])
+    with_rows(page, [[0, 0, 0], [600, 400, 0]])  # longer than any test
     before = steps(page)
     page.click("[aria-label='Play the gaze path']")
     until(page, "() => studio.gazePanel.film.n > 3")
     page.click("[aria-label='Pause the gaze path']")
-    at_rest(page)
+    settle(page)
     n, (x, y) = page.evaluate("studio.gazePanel.film.n"), gaze(page)
 
-    assert (x, y) == pytest.approx((20.0 * n / 30.0, 0.0))
+    assert (x, y) == pytest.approx((400.0 / 600.0 * n / 30.0, 0.0))
     assert steps(page) == before + 1
 
 
@@ -271,7 +266,7 @@ def test_points_are_dragged_on_the_image(visit):
     page.mouse.down()
     page.mouse.move(x + 10, y + 6, steps=3)
     page.mouse.up()
-    at_rest(page)
+    settle(page)
     rows = path_of(page)
 
     assert rows[:2] == ROWS[:2]
@@ -280,7 +275,7 @@ def test_points_are_dragged_on_the_image(visit):
     # A click shows the time of a point.
     x, y, _ = page.evaluate(target, 1)
     page.mouse.click(x, y)
-    at_rest(page)
+    settle(page)
     assert page.evaluate("studio.gazePanel.time") == pytest.approx(0.2)
     assert gaze(page) == pytest.approx(ROWS[1][1:])
 
@@ -291,11 +286,11 @@ def test_table_edits_are_undo_steps(visit):
     page.click(TABLE)
     page.fill("[aria-label='x of row 2, µm']", "0.07 mm")
     page.keyboard.press("Enter")
-    at_rest(page)
+    settle(page)
     assert path_of(page)[1] == [0.2, 70, 120]
     page.fill("[aria-label='time of row 1, s']", "1/4")
     page.keyboard.press("Enter")
-    at_rest(page)
+    settle(page)
     assert [row[0] for row in path_of(page)] == [0.2, 0.25, 0.4]
     page.fill("[aria-label='time of row 1, s']", "0.25")
     page.keyboard.press("Enter")
@@ -303,13 +298,13 @@ def test_table_edits_are_undo_steps(visit):
     assert "0.25 s in row 2 after 0.25 s in row 1" in page.inner_text("#gaze .quiet")
     until(page, "() => document.querySelector(\"[aria-label='time of row 1, s']\").value === '0.2'")
     page.click("[aria-label='Delete row 3']")
-    at_rest(page)
+    settle(page)
     assert [row[0] for row in path_of(page)] == [0.2, 0.25]
     page.evaluate("() => studio.gazePanel.film.go(3)")
-    at_rest(page)
+    settle(page)
     set_value(page, "gaze_um", [11, 12])
     page.click("[aria-label='Insert the present gaze at the present time']")
-    at_rest(page)
+    settle(page)
     assert path_of(page)[0] == pytest.approx([0.1, 11, 12])
     assert len(path_of(page)) == 3
 
@@ -324,7 +319,7 @@ def test_long_paths_are_shown_in_parts(visit):
     page.click("[aria-label='Later rows']")
     assert page.inner_text(".gaze-head .quiet") == "101–120 of 120 rows"
     page.click("[aria-label='Delete row 120']")
-    at_rest(page)
+    settle(page)
     assert len(path_of(page)) == 119
 
 
@@ -340,7 +335,7 @@ def test_files_and_saccades_are_undo_steps(visit, tmp_path):
         page.click("#gaze .menu >> text=Open CSV…")
     chooser.value.set_files(tmp_path / "eye.csv")
     until(page, "() => studio.state.settings.gaze_path")
-    at_rest(page)
+    settle(page)
     assert path_of(page) == ROWS
     page.click("#gaze-menu")
     with page.expect_download() as download:
@@ -353,10 +348,10 @@ def test_files_and_saccades_are_undo_steps(visit, tmp_path):
     page.fill("#saccades-dialog [name=seed]", "5")
     page.click("#saccades-dialog [value=create]")
     until(page, "() => studio.state.settings.gaze_path?.length === 60")
-    at_rest(page)
+    settle(page)
     page.click("#gaze-menu")
     page.click("#gaze .menu >> text=Clear")
-    at_rest(page)
+    settle(page)
     assert path_of(page) is None
     assert steps(page) == 3
 
@@ -365,7 +360,7 @@ def test_dropped_file_opens_the_row(visit):
     page = visit()
     drop(page, "eye.csv", b"t_s,x_um,y_um\n0,1,2\n1,3,4\n")
     until(page, "() => !document.getElementById('gaze').hidden")
-    at_rest(page)
+    settle(page)
 
     assert path_of(page) == [[0, 1, 2], [1, 3, 4]]
 
@@ -391,27 +386,28 @@ def test_path_works_by_keyboard(visit):
     page = visit()
     keys, start = Keys(page), gaze(page)
     keys.use("#gaze-path")
+    hold_clock(page)
     keys.use("#gaze .record")
     keys.to("#scene .marks")
     for key in ("ArrowRight", "ArrowRight", "ArrowUp"):
-        page.wait_for_timeout(150)
+        pass_time(page, 150)
         keys.press(key)
     keys.use("#gaze .record")
-    at_rest(page)
+    settle(page)
     rows = np.array(path_of(page))
     moved = rows[-1, 1:] - start
     assert moved[0] > 0
     assert moved[0] == pytest.approx(2 * moved[1], rel=0.01)
     keys.use("#gaze [aria-label='Play the gaze path']")
     until(page, "() => !studio.gazePanel.film.isPlaying && studio.gazePanel.film.n > 0")
-    at_rest(page)
+    settle(page)
     keys.use("#gaze [aria-label='Show the rows of the gaze path']")
     keys.use("[aria-label='Delete row 1']")
-    at_rest(page)
+    settle(page)
     assert len(path_of(page)) == len(rows) - 1
     keys.use("#gaze-menu")
     keys.press("End", "Enter")
-    at_rest(page)
+    settle(page)
     assert path_of(page) is None
     assert keys.n_pointed == 0
 
@@ -442,7 +438,7 @@ def test_slider_shows_times_of_the_path(visit):
     with_rows(page)
     before = steps(page)
     page.locator("#gaze input[type=range]").fill("3")
-    at_rest(page)
+    settle(page)
 
     assert gaze(page) == pytest.approx(interpolated(ROWS, 0.1))
     assert page.locator("#gaze input[type=range]").get_attribute("aria-valuetext").startswith("0.10 s")

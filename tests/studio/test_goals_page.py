@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import Server, answered, change, setting, settle, until
+from studio.page_tools import Server, change, noticed, setting, settle, until
 from studio.test_daily_page import field
 
 from foveasim.cli import app
@@ -32,7 +32,7 @@ def fill(page, tile, *, measure, value, limit="at least", region=None, annulus=N
     form.locator("select[aria-label=Condition]").select_option(label=limit)
     form.locator("input[aria-label=Value]").fill(str(value))
     form.locator("input[aria-label=Value]").press("Enter")
-    answered(page)
+    settle(page)
 
 
 def test_exposure_for_a_ratio_in_the_periphery(visit):
@@ -90,7 +90,7 @@ def test_sensor_with_requirements(browser, tmp_path, visit):
         page.click("#save")
         page.fill("#save-name", "third")
         page.click("#save-form button[value=save]")
-        until(page, "() => document.getElementById('notice').textContent.startsWith('Saved')")
+        noticed(page, "Saved")
     finally:
         own.stop()
     saved = yaml.safe_load((tmp_path / "third.yaml").read_text())

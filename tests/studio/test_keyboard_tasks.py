@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import Keys, Server, codes, setting, until
+from studio.page_tools import Keys, Server, codes, noticed, setting, until
 from studio.test_sources_page import video
 
 import foveasim as fs
@@ -138,7 +138,7 @@ def test_sensor_with_requirements(visit, tmp_path):
     try:
         keys = Keys(visit(is_checked=False, address=own.address))
         page = keys.page
-        until(page, "() => window.studio && studio.isReady && studio.views.parts.picture")
+        until(page, "() => window.studio && studio.isIdle && studio.views.parts.picture")
         keys.show("requirements")
         page.wait_for_selector("#tile-requirements select[aria-label=Result] option[value=mtf]", state="attached")
         requirement(keys, "requirements", measure="photosites", value="19,800", limit="at least")
@@ -154,7 +154,7 @@ def test_sensor_with_requirements(visit, tmp_path):
         keys.press("Enter")
         page.keyboard.type("third")
         keys.press("Enter")
-        until(page, "() => document.getElementById('notice').textContent.startsWith('Saved')")
+        noticed(page, "Saved")
         assert keys.n_pointed == 0
     finally:
         own.stop()

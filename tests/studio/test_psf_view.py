@@ -73,4 +73,4 @@ def test_tile_shows_the_point_spread(visit):
     until(page, "() => studio.views.made.psf?.chart.curves.length === 4")
     assert "light within a square of the site's area: nearest" in page.inner_text("#tile-psf .chart-note")
     set_value(page, "optics.f_number", 8.0)
-    until(page, "() => studio.isReady && studio.views.made.psf.chart.curves[0].y.every((value) => value < 0.1)")
+    until(page, "() => studio.isIdle && studio.views.made.psf.chart.curves[0].y.every((value) => value < 0.1)")

@@ -17,6 +17,7 @@ pytest.importorskip("uvicorn")
 from PIL import Image
 from studio.page_tools import (
     SOFTWARE,
+    TIMEOUT_MS,
     change,
     codes,
     drop,
@@ -57,15 +58,9 @@ def video(tmp_path, name="clip.mp4", n_frames=12):
     return write_film(tmp_path / name, frames, rate=10, codec=codec, pixels=pixels).read_bytes()
 
 
-def ready(page):
-    until(
-        page, "() => studio.isReady && !studio.sources.film?.isBusy && studio.connection.requests.waiting.length === 0"
-    )
-
-
 def film(page):
     until(page, "() => studio.state.film && !document.getElementById('film').hidden")
-    ready(page)
+    settle(page)
     return page.evaluate("studio.state.film")
 
 
@@ -91,10 +86,18 @@ def drop_all(page, files):
     )
 
 
+def hold_frames(page):
+    """Show each frame of the video only when the test calls ``release``; ``shown`` lists those that were asked for."""
+    page.evaluate("""() => { const { film } = studio.sources, { show } = film;
+      Object.assign(window, { shown: [], release: null, releaseAll: () => { film.show = show; release?.(); } });
+      film.show = async (n, isFinal) => { shown.push(n); await new Promise((resolve) => { release = resolve; }); return show(n, isFinal); }; }""")
+
+
 def message(page, pattern):
+    """Wait for a problem, or for a notice, which the page may have hidden since."""
     until(
         page,
-        "pattern => [document.getElementById('problem'), document.getElementById('notice')].some((e) => !e.hidden && new RegExp(pattern).test(e.textContent))",
+        "pattern => ['problem:not([hidden])', 'notice'].some((id) => new RegExp(pattern).test(document.querySelector('#' + id)?.textContent))",
         pattern,
     )
 
@@ -112,16 +115,16 @@ def test_dropped_video_shows_its_frames(visit, tmp_path, name):
     first = codes(page)
     page.click("[aria-label='One frame forward']")
     until(page, "() => studio.state.film.n === 1")
-    ready(page)
+    settle(page)
     second = codes(page)
     assert second.mean() > first.mean()
     page.locator("#film input").fill("11")
     until(page, "() => studio.state.film.n === 11")
-    ready(page)
+    settle(page)
     assert codes(page).mean() > second.mean()
     page.click("[aria-label='One frame back']")
     until(page, "() => studio.state.film.n === 10")
-    ready(page)
+    settle(page)
     assert "11 / 12" in page.inner_text("#film .quiet")
     change(page, "() => { studio.connection.send({ do: 'undo' }); }")
     assert setting(page, "scene.picture") == "skimage:astronaut"
@@ -136,7 +139,7 @@ def test_video_plays_while_gaze_moves(visit, tmp_path):
     until(page, "() => studio.state.film.n >= 3")
     page.evaluate("() => { studio.connection.set('gaze_um', [-100, 250], true); }")
     until(page, "() => studio.state.film.n === 11 && !studio.sources.film.isPlaying")
-    ready(page)
+    settle(page)
 
     assert setting(page, "gaze_um") == [-100, 250]
     change(page, "() => { studio.connection.send({ do: 'undo' }); }")
@@ -151,11 +154,10 @@ def test_every_key_counts_during_frames(visit, tmp_path):
     page = visit()
     drop(page, "clip.mp4", video(tmp_path))
     film(page)
-    page.evaluate("""() => { window.shown = []; const { film } = studio.sources, { show } = film;
-      film.show = async (n, isFinal) => { shown.push(n); await new Promise((resolve) => { film.release = resolve; }); return show(n, isFinal); }; }""")
+    hold_frames(page)
 
     def release(n):
-        page.evaluate("() => studio.sources.film.release()")
+        page.evaluate("() => release()")
         until(page, "n => shown.length === n", n)
 
     slider = page.locator("#film input[type=range]")
@@ -169,9 +171,8 @@ def test_every_key_counts_during_frames(visit, tmp_path):
     release(3)
     page.click("[aria-label='One frame back']")
     release(4)
-    page.evaluate("() => studio.sources.film.release()")
-    until(page, "() => studio.state.film.n === 4")
-    ready(page)
+    page.evaluate("() => release()")
+    settle(page)
 
     assert page.evaluate("shown") == [1, 2, 5, 4]
     assert slider.input_value() == "4"
@@ -183,7 +184,7 @@ def test_archive_of_frame_has_same_codes(visit, tmp_path):
     film(page)
     page.evaluate("() => { studio.sources.film.go(7); }")
     until(page, "() => studio.state.film.n === 7")
-    ready(page)
+    settle(page)
     names = unzipped(page, tmp_path / "all")
 
     assert {"clip_frame_7.png", "test.yaml", "test.py", "test.ipynb"} <= set(names)
@@ -224,7 +225,7 @@ def test_folder_becomes_a_film_strip(visit, tmp_path):
     page = visit()
     drop_all(page, [(f"picture {k}.png", png(k)) for k in (10, 2, 1)])
     until(page, "() => !document.getElementById('strip').hidden")
-    ready(page)
+    settle(page)
 
     assert page.locator("#strip button").evaluate_all("all => all.map((b) => b.title)") == [
         "picture 1.png",
@@ -234,11 +235,11 @@ def test_folder_becomes_a_film_strip(visit, tmp_path):
     assert "picture_1" in setting(page, "scene.picture")
     page.locator("#strip button").nth(2).click()
     until(page, "() => /picture_10/.test(studio.state.settings.scene.picture)")
-    ready(page)
+    settle(page)
     assert page.locator("#strip [aria-current=true]").get_attribute("title") == "picture 10.png"
     page.click("[aria-label='Play']")
     until(page, "() => studio.sources.film.n === 2 && !studio.sources.film.isPlaying", None)
-    ready(page)
+    settle(page)
     names = unzipped(page, tmp_path / "all")
     assert "picture_10.png" in names
     assert np.array_equal(codes(page), codes_of(tmp_path / "all" / "test.yaml"))
@@ -250,10 +251,10 @@ def test_corrupt_picture_of_folder_is_named(visit):
     page = visit()
     drop_all(page, [("a.png", png(1)), ("b.png", b"no picture")])
     until(page, "() => !document.getElementById('strip').hidden")
-    ready(page)
+    settle(page)
     page.locator("#strip button").nth(1).click()
     message(page, r"b\.png")
-    ready(page)
+    settle(page)
 
     assert "a.png" in setting(page, "scene.picture")
 
@@ -264,7 +265,7 @@ def test_source_menu_selects_test_chart(visit):
     page.focus("#source")
     page.keyboard.press("Enter")
     page.locator("#source-menu button", has_text="Siemens star").click()
-    until(page, "() => studio.state.settings.scene.kind === 'siemens_star' && studio.isReady")
+    until(page, "() => studio.state.settings.scene.kind === 'siemens_star' && studio.isIdle")
 
     assert page.evaluate("Object.keys(studio.state.errors).length") == 0
     assert len(np.unique(codes(page))) > 2
@@ -289,7 +290,7 @@ def visit_camera(server, camera_browser):
         context = camera_browser.new_context(viewport={"width": 1280, "height": 800}, **{"bypass_csp": True, **options})
         contexts.append(context)
         page = context.new_page()
-        page.set_default_timeout(60_000)
+        page.set_default_timeout(TIMEOUT_MS)
         page.goto(server.address)
         settle(page)
         return page
@@ -316,9 +317,10 @@ def test_camera_frames_follow_live(visit_camera, tmp_path):
     page.evaluate("() => { studio.connection.set('exposure_s', 0.01, true); }")
     until(page, "() => studio.state.settings.exposure_s === 0.01")
     page.click("#film button:has-text('Stop')")
-    ready(page)
+    settle(page)
     n = page.evaluate("studio.state.film.n")
-    page.wait_for_timeout(300)
+    # A frame of the camera would come before the answer to a later message.
+    change(page, "() => { studio.connection.send({ do: 'pin', sites: [] }); }")
     assert page.evaluate("studio.state.film.n") == n
     names = unzipped(page, tmp_path / "all")
     assert sum(name.startswith("camera_") for name in names) == 1
@@ -389,7 +391,7 @@ def test_missing_camera_gives_one_line(visit):
 
 def rows(page):
     until(page, "() => document.querySelectorAll('#comparison tr').length > 5")
-    ready(page)
+    settle(page)
     found = page.locator("#comparison tr[data-name]").evaluate_all(
         "all => all.map((row) => [row.dataset.name, [...row.querySelectorAll('td')].map((cell) => cell.textContent)])"
     )
@@ -402,12 +404,12 @@ def test_match_gives_the_same_number_of_sites(visit):
     form = page.locator(".control[data-key='layout'] select")
     form.evaluate("select => { select.closest('details').open = true; }")
     form.select_option(label="grid")
-    until(page, "() => studio.isReady && studio.state.settings.layout.generator === 'grid'")
+    until(page, "() => studio.isIdle && studio.state.settings.layout.generator === 'grid'")
     until(page, "() => document.querySelectorAll('#comparison tr.differs').length > 5")
     before = rows(page)
     assert before["n_sites"] == ["912", "14,400"]
     page.click("#match")
-    until(page, "() => studio.isReady && studio.panes.b.sites.n < 2000")
+    until(page, "() => studio.isIdle && studio.panes.b.sites.n < 2000")
     after = rows(page)
 
     assert after["n_sites"] == ["912", "900"]
@@ -436,7 +438,7 @@ def test_equal_variants_have_equal_rows(visit):
 def test_notebook_of_page_names_its_files(visit, tmp_path):
     page = visit()
     drop(page, "photo.png", png(3))
-    until(page, "() => /photo/.test(studio.state.settings.scene.picture) && studio.isReady")
+    until(page, "() => /photo/.test(studio.state.settings.scene.picture) && studio.isIdle")
     page.click("#file")
     with page.expect_download() as download:
         page.click("[data-file=notebook]")
@@ -468,10 +470,10 @@ def test_link_restores_the_state(visit, server):
     other.click("[data-do=open-link]")
     other.fill("#link-text", shared)
     other.click("#link-form button[value=open]")
-    until(other, "() => studio.state.settings.optics.f_number === 4 && studio.isReady")
+    until(other, "() => studio.state.settings.optics.f_number === 4 && studio.isIdle")
     assert np.array_equal(codes(other), wanted)
     third = visit(address=own)
-    until(third, "() => window.studio && studio.isReady && studio.state.settings.optics.f_number === 4")
+    until(third, "() => window.studio && studio.isIdle && studio.state.settings.optics.f_number === 4")
     assert np.array_equal(codes(third), wanted)
     assert third.evaluate("location.hash") == "#" + token
     assert third.is_enabled("#undo")
@@ -521,7 +523,7 @@ def test_links_cannot_name_other_files(visit):
 def test_link_lists_uploaded_files(visit):
     page, other = visit(), visit()
     drop(page, "photo.png", png(3))
-    until(page, "() => /photo/.test(studio.state.settings.scene.picture) && studio.isReady")
+    until(page, "() => /photo/.test(studio.state.settings.scene.picture) && studio.isIdle")
     link = copied_link(page, "share")
     message(page, r"only the names of uploaded files: photo\.png")
     other.evaluate("link => { location.hash = link.slice(link.indexOf('#')); }", link)

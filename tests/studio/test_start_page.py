@@ -9,7 +9,7 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
 from reference.accessibility import violations
-from studio.page_tools import SHOT, Server, setting, settle, until
+from studio.page_tools import SHOT, Server, setting, settle, type_ahead, until
 
 import foveasim as fs
 from foveasim.config import bundled_layouts, demo_settings
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.needs("chromium")
 OPEN = "document.getElementById('start').open"
 HAS_CARDS = f"() => {OPEN} && document.querySelectorAll('#start .card').length > 0"
 N_SITES = "studio.panes.b.sites.n"
-STEPS = "() => studio.isReady && studio.state.can_undo && studio.connection.requests.doneId >= studio.connection.requests.lastId"
+STEPS = "() => studio.isIdle && studio.state.can_undo"
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_presets_are_chosen_by_mouse(open_start):
     assert page.evaluate(OPEN) is False
     assert page.evaluate(N_SITES) == fs.read_layout("prima_100").n_sites
     page.click("#undo")
-    until(page, f"before => studio.isReady && {N_SITES} === before", before)
+    until(page, f"before => studio.isIdle && {N_SITES} === before", before)
 
 
 def test_new_sensor_is_created_by_mouse(open_start):
@@ -130,7 +130,7 @@ def test_new_sensor_is_created_by_mouse(open_start):
     if n_sites != 3000:
         assert page.inner_text("#notice") == f"{n_sites:,} photosites, the nearest possible number to 3,000"
     page.click("#undo")
-    until(page, f"before => studio.isReady && {N_SITES} === before && !studio.state.can_undo", before)
+    until(page, f"before => studio.isIdle && {N_SITES} === before && !studio.state.can_undo", before)
 
 
 def test_new_sensor_is_created_by_keyboard(open_start):
@@ -143,9 +143,9 @@ def test_new_sensor_is_created_by_keyboard(open_start):
     for _ in range(1 + len(demo_settings()) + len(bundled_layouts()) + 1):
         page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.id") == "start-generator"
-    page.keyboard.type("hexagonal", delay=20)
+    type_ahead(page, "hexagonal")
     page.keyboard.press("Tab")
-    page.keyboard.type("own", delay=20)
+    type_ahead(page, "own")
     page.keyboard.press("Tab")
     page.keyboard.type("0,9")
     page.keyboard.press("Tab")
@@ -188,7 +188,7 @@ def test_recent_files_are_opened(open_start):
 
     assert setting(page, "exposure_s") == 0.004
     page.click("#undo")
-    until(page, "() => studio.isReady && studio.state.settings.exposure_s === 0.02")
+    until(page, "() => studio.isIdle && studio.state.settings.exposure_s === 0.02")
 
 
 def test_thumbnails_load_when_they_are_visible(visit, start_server):

@@ -16,12 +16,12 @@ pytest.importorskip("uvicorn")
 from studio.page_tools import (
     TIMEOUT_MS,
     Server,
-    answered,
     change,
     codes,
     control,
     drop,
     has_picture,
+    noticed,
     record_changes,
     set_value,
     setting,
@@ -115,6 +115,7 @@ def test_selection_matches_its_sites(visit):
     page.mouse.move(0.5 * (ax + bx), 0.5 * (ay + by))
     page.mouse.move(bx, by)
     page.mouse.up()
+    settle(page)
     chosen = page.evaluate("studio.page.selected")
     centres = np.array(
         page.evaluate("() => Array.from({ length: studio.panes.b.sites.n }, (_, i) => studio.panes.b.sites.centre(i))")
@@ -165,7 +166,7 @@ def test_violations_of_earlier_layout_vanish(visit):
     assert page.evaluate("nDrawn") == 1
     assert page.evaluate("studio.rules.traceOn(studio.panes.b.sites)") is None
     page.click("[data-tile=rules]")
-    answered(page)
+    settle(page)
     assert page.evaluate("studio.rules.sites === studio.panes.b.sites")
 
 
@@ -284,7 +285,7 @@ def test_slider_drag_is_one_step(visit):
         page.mouse.move(box["x"] + 6 + start * (box["width"] - 12) + 3 * k, y)
     page.mouse.up()
     until(page, "() => changes.at(-1)?.final")
-    answered(page)
+    settle(page)
     sent = page.evaluate("changes")
 
     assert [message["final"] for message in sent] == [False] * (len(sent) - 1) + [True]
@@ -300,7 +301,7 @@ def test_slider_back_at_start_is_released(visit):
     page.evaluate("""() => { const slider = document.querySelector(".control[data-key='optics.f_number'] input[type=range]"), start = slider.value;
       for (const value of [Number(start) + 50, start]) { slider.value = value; slider.dispatchEvent(new Event("input", { bubbles: true })); }
       slider.dispatchEvent(new PointerEvent("pointerup", { bubbles: true })); }""")
-    answered(page)
+    settle(page)
     assert setting(page, "optics.f_number") == 2.8
     assert page.is_disabled("#undo")
     change(page, "() => { studio.connection.set('optics.f_number', 5.6, true); }")
@@ -314,7 +315,7 @@ def test_previews_wait_for_answers(visit):
     page.evaluate(
         "() => { for (let k = 0; k < 50; k++) studio.connection.set('exposure_s', 0.01 + 0.001 * k, false); }"
     )
-    until(page, "() => studio.isReady && studio.state.settings.exposure_s > 0.0589")
+    until(page, "() => studio.isIdle && studio.state.settings.exposure_s > 0.0589")
     first, second = page.evaluate("changes")
 
     assert [round(message["value"], 6) for message in (first, second)] == [0.01, 0.059]
@@ -450,7 +451,7 @@ def test_gaze_follows_drag_on_scene(visit):
     page.mouse.up()
     until(
         page,
-        "() => studio.isReady && studio.state.can_undo && studio.connection.requests.doneId >= studio.connection.requests.lastId",
+        "() => studio.isIdle && studio.state.can_undo",
     )
 
     assert setting(page, "gaze_um") == pytest.approx([-40.0, 260.0], abs=3.0)
@@ -465,7 +466,7 @@ def test_preset_replaces_the_layout(visit):
     )
     before = page.evaluate("studio.panes.b.sites.n")
     page.select_option("#preset", name)
-    until(page, "before => studio.panes.b.sites.n !== before && studio.isReady", before)
+    until(page, "before => studio.panes.b.sites.n !== before && studio.isIdle", before)
 
     assert page.input_value("#preset") == ""
     page.click("#undo")
@@ -485,7 +486,7 @@ def test_dropped_photograph_becomes_the_scene(visit):
     drop(page, "photo.png", buffer.getvalue())
     until(
         page,
-        "() => /photo/.test(studio.state.settings.scene.picture) && studio.isReady && studio.connection.requests.doneId >= studio.connection.requests.lastId",
+        "() => /photo/.test(studio.state.settings.scene.picture) && studio.isIdle",
     )
 
     assert not np.array_equal(codes(page), before)
@@ -498,7 +499,7 @@ def test_corrupt_picture_keeps_the_state(visit):
     drop(page, "photo.png", b"\x89PNG\r\n\x1a\n" + bytes(100))
     until(
         page,
-        "() => [document.getElementById('problem'), document.getElementById('notice')].some((e) => !e.hidden && /photo\\.png/.test(e.textContent))",
+        "() => ['problem:not([hidden])', 'notice'].some((id) => /photo\\.png/.test(document.querySelector('#' + id)?.textContent))",
     )
 
     assert setting(page, "scene.picture") == "skimage:astronaut"
@@ -553,27 +554,28 @@ def test_restarted_server_restores_state(browser, tmp_path, visit):
         until(page, "() => document.body.classList.contains('offline')")
         # Several attempts fail; a view that is not loaded yet is shown later.
         page.click("#tabs button[data-tile=snr]")
+        noticed(page, "cannot be shown")
         page.click("#start-open")
+        noticed(page, "The start page cannot be shown: the server does not answer")
         page.locator("#scene .marks").press("ArrowUp")
         page.locator("#scene .marks").press("ArrowUp")
         until(page, "() => studio.connection.delay > 1000")
-        assert "the server does not answer" in page.inner_text("#notice")
         control(page, "optics.f_number").fill("4")
         control(page, "optics.f_number").press("Enter")
         own.start()
         until(
             page,
-            "() => studio.isReady && studio.state.settings.exposure_s === 0.007 && studio.state.settings.optics.f_number === 4",
+            "() => studio.isIdle && studio.state.settings.exposure_s === 0.007 && studio.state.settings.optics.f_number === 4",
         )
         until(
             page,
-            "() => !document.body.classList.contains('offline') && studio.connection.requests.doneId >= studio.connection.requests.lastId",
+            "() => !document.body.classList.contains('offline') && studio.isIdle",
         )
         # Each arrow key counted, also without a server.
         assert setting(page, "gaze_um")[1] > gaze_um[1]
         page.locator("#scene .marks").press("ArrowDown")
         page.locator("#scene .marks").press("ArrowDown")
-        answered(page)
+        settle(page)
         assert setting(page, "gaze_um") == pytest.approx(gaze_um, abs=0.2)
         set_value(page, "gaze_um", gaze_um)
         change(page, "() => { studio.connection.set('optics.f_number', 2.8, true); }")
@@ -605,12 +607,12 @@ def test_keyboard_alone_changes_and_undoes(visit):
     else:
         pytest.fail("the slider cannot be reached")
     page.keyboard.press("ArrowRight")
-    until(page, "() => studio.state.settings.optics.f_number > 2.8 && studio.isReady")
+    until(page, "() => studio.state.settings.optics.f_number > 2.8 && studio.isIdle")
     assert page.evaluate(describe)[:2] == ["optics.f_number", "range"]
     page.keyboard.press("Control+z")
-    until(page, "() => studio.state.settings.optics.f_number === 2.8 && studio.isReady")
+    until(page, "() => studio.state.settings.optics.f_number === 2.8 && studio.isIdle")
     page.keyboard.press("Control+Shift+z")
-    until(page, "() => studio.state.settings.optics.f_number > 2.8 && studio.isReady")
+    until(page, "() => studio.state.settings.optics.f_number > 2.8 && studio.isIdle")
     page.focus("#file")
     page.keyboard.press("Enter")
     page.keyboard.press("ArrowDown")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import threading
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from reference.accessibility import violations
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import Server, change, has_picture, set_value, setting, settle, until
+from studio.page_tools import Server, change, has_picture, set_value, setting, settle, type_ahead, until
 
 from foveasim.config import build_shot, put_setting
+from foveasim.studio._sweeps.running import Sweeps
 
 pytestmark = pytest.mark.needs("chromium")
 
@@ -29,7 +31,7 @@ def open_sweep(visit, **options):
     settle(page)
     page.click("[data-tile=sweep]")
     page.wait_for_selector("#tile-sweep select[aria-label=Result] option[value=snr]", state="attached")
-    until(page, "() => studio.isReady")
+    until(page, "() => studio.isIdle")
     return page
 
 
@@ -82,7 +84,7 @@ def test_map_point_is_applied_by_a_click(visit):
     page.mouse.move(box["x"] + box["width"] - 80, box["y"] + 40)
     assert page.inner_text("#sweep .chart-note").startswith("exposure 100 ms, f-number 4: mean code ")
     page.mouse.click(box["x"] + box["width"] - 80, box["y"] + 40)
-    until(page, "() => studio.isReady && studio.state.settings.exposure_s === 0.1")
+    until(page, "() => studio.isIdle && studio.state.settings.exposure_s === 0.1")
     assert setting(page, "optics.f_number") == 4
     change(page, "() => document.getElementById('undo').click()")
     assert (setting(page, "exposure_s"), setting(page, "optics.f_number")) == (0.02, 2.8)
@@ -106,7 +108,7 @@ def test_curves_and_their_files(visit):
             assert [row[1] for row in rows[1:]] == [str(int(count)) for count in counts]
     box = page.locator("#sweep canvas").bounding_box()
     page.mouse.click(box["x"] + 50, box["y"] + box["height"] - 60)
-    until(page, "() => studio.isReady && studio.state.settings.layout.parameters.n_sectors === 24")
+    until(page, "() => studio.isIdle && studio.state.settings.layout.parameters.n_sectors === 24")
     assert page.evaluate("studio.state.summary.n_sites") == counts[0]
 
 
@@ -172,39 +174,55 @@ def test_sweep_with_the_keyboard_alone(visit):
     press_until(page, "() => document.activeElement.dataset.tile === 'sweep'")
     page.keyboard.press("Enter")
     page.wait_for_selector("#tile-sweep select[aria-label=Result] option[value=snr]", state="attached")
-    until(page, "() => studio.isReady")
+    until(page, "() => studio.isIdle")
     press_until(page, focus("(e) => e.ariaLabel === 'Number of values'"))
     page.keyboard.press("Control+A")
     page.keyboard.type("3")
     press_until(page, focus("(e) => e.ariaLabel === 'Result'"))
-    page.keyboard.type("mean")
+    type_ahead(page, "mean")
     page.keyboard.press("Enter")
     press_until(page, focus("(e) => e.textContent === 'Run'"))
     page.keyboard.press("Enter")
     until(page, IS_DONE)
     press_until(page, focus("(e) => e.ariaLabel === 'Chart'"))
-    page.keyboard.type("Table")
+    type_ahead(page, "Table")
     page.keyboard.press("Enter")
     press_until(page, focus("(e) => e.textContent === 'Apply'"))
     assert page.evaluate("document.activeElement.ariaLabel") == "Apply exposure 10 µs"
     page.keyboard.press("Enter")
-    until(page, "() => studio.isReady && studio.state.settings.exposure_s === 1e-5")
+    until(page, "() => studio.isIdle && studio.state.settings.exposure_s === 1e-5")
     assert page.evaluate("document.activeElement.textContent") == "Apply"
     page.keyboard.press("Control+z")
-    until(page, "() => studio.isReady && studio.state.settings.exposure_s === 0.02")
+    until(page, "() => studio.isIdle && studio.state.settings.exposure_s === 0.02")
 
 
-def test_page_is_usable_during_a_sweep(visit):
+@pytest.fixture
+def permit_points(monkeypatch):
+    """Sweeps compute only as many points as the test permits."""
+    compute_next, permitted = Sweeps.compute_next, threading.Semaphore(0)
+
+    def compute(sweeps, simulate):
+        if permitted.acquire(timeout=0.01):
+            compute_next(sweeps, simulate)
+            sweeps.send()
+
+    monkeypatch.setattr(Sweeps, "compute_next", compute)
+    return permitted.release
+
+
+def test_page_is_usable_during_a_sweep(visit, permit_points):
     """A change is applied between two points, cancelling leaves those that are computed, and a new sweep replaces it."""
     page = open_sweep(visit)
     choose_axis(page, "Setting", "layout.parameters.n_sectors", low=24, high=200, n=60)
     choose_axis(page, "Second setting", "optics.f_number", low=2, high=8, n=16)
     page.click("#tile-sweep button:text-is('Run')")
+    permit_points(4)
     until(page, "() => studio.views.made.sweep.points?.values.length > 1")
     assert "do not affect this sweep" in page.inner_text("#sweep-text")
     set_value(page, "exposure_s", 0.03)
     page.click("[data-tile=sweep]")
     n_done = page.evaluate("studio.page.sweep.points.length")
+    permit_points(4)
     until(page, "n => studio.page.sweep.points.length > n", n_done)
     assert page.is_hidden("#tile-sweep")  # further points do not open it again
     page.click("[data-tile=sweep]")
@@ -215,35 +233,38 @@ def test_page_is_usable_during_a_sweep(visit):
     assert setting(page, "exposure_s") == 0.03
     choose_axis(page, "Second setting", "")
     choose_axis(page, "Setting", "optics.f_number", n=2)
+    permit_points(1000)
     run(page)
     assert len(values(page)) == 2
 
 
-def test_restarted_server_ends_the_sweep(visit, tmp_path):
+def test_restarted_server_ends_the_sweep(visit, tmp_path, permit_points):
     """Results so far remain; the new session has no sweep to cancel, and no file of it."""
     own = Server(tmp_path)
     try:
         page = open_sweep(visit, is_checked=False, address=own.address)
         choose_axis(page, "Setting", "layout.parameters.n_sectors", low=24, high=200, n=60)
         page.click("#tile-sweep button:text-is('Run')")
+        permit_points(4)
         until(page, "() => studio.views.made.sweep.points?.values.length > 1")
         own.stop()
         until(page, "() => document.body.classList.contains('offline')")
         n_done = page.evaluate("studio.page.sweep.points.length")
         own.start()
-        until(page, "() => studio.isReady && !document.body.classList.contains('offline')")
+        until(page, "() => studio.isIdle && !document.body.classList.contains('offline')")
 
         assert page.inner_text("#sweep-text") == f"The session ended after {n_done} of 60 points."
         assert page.is_hidden("#tile-sweep button[aria-label='Cancel the sweep']")
         assert page.is_hidden("#tile-sweep button:text-is('Sweep file')")
         assert page.evaluate("studio.views.made.sweep.points.values.length") == n_done
         choose_axis(page, "Setting", "optics.f_number", n=2)
+        permit_points(1000)
         run(page)
         assert page.is_visible("#tile-sweep button:text-is('Sweep file')")
         own.stop()
         until(page, "() => document.body.classList.contains('offline')")
         own.start()
-        until(page, "() => studio.isReady && !document.body.classList.contains('offline')")
+        until(page, "() => studio.isIdle && !document.body.classList.contains('offline')")
         assert page.inner_text("#sweep-text") == "2 points."
         assert page.is_hidden("#tile-sweep button:text-is('Sweep file')")
     finally:

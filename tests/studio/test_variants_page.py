@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import Server, answered, change, set_value, setting, settle, until
+from studio.page_tools import Server, change, set_value, setting, settle, until
 
 pytestmark = pytest.mark.needs("chromium")
 
@@ -31,7 +31,7 @@ def keep(page, name):
 
 
 def cells(page):
-    answered(page)
+    settle(page)
     found = page.locator("#comparison tr[data-name]").evaluate_all(
         "all => all.map((row) => [row.dataset.name, [...row.querySelectorAll('td')].map((cell) => cell.textContent)])"
     )
@@ -68,7 +68,7 @@ def test_hexagons_against_squares(tmp_path, visit):
         # After a restart, the page has the variants and compares them again.
         own.stop()
         own.start()
-        until(page, "() => studio.isReady && studio.state.variants.filter((each) => each.is_compared).length === 3")
+        until(page, "() => studio.isIdle && studio.state.variants.filter((each) => each.is_compared).length === 3")
         assert page.input_value("#variants li:first-child input[aria-label^='Note']") == "a quarter of the photosites"
         until(page, "() => document.querySelectorAll('#comparison th[scope=col]').length === 4")
         change(page, "() => document.querySelector(\"button[aria-label='Apply squares']\").click()")
@@ -78,7 +78,7 @@ def test_hexagons_against_squares(tmp_path, visit):
         assert setting(page, "layout")["generator"] != "grid"
 
         page.click("button[aria-label='Show squares as A']")
-        until(page, "() => studio.isReady && studio.page.frozen?.isKept && studio.panes.a.sites.n === 900")
+        until(page, "() => studio.isIdle && studio.page.frozen?.isKept && studio.panes.a.sites.n === 900")
         assert page.evaluate("studio.panes.b.sites.n") != 900
         page.click("button[aria-label='Delete hexagons']")
         page.click("#confirm-verb")
@@ -110,7 +110,7 @@ def test_variants_by_keyboard(visit):
         page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.ariaLabel") == "Apply start"
     page.keyboard.press("Enter")
-    until(page, "() => studio.isReady && studio.state.settings.exposure_s === 0.02")
+    until(page, "() => studio.isIdle && studio.state.settings.exposure_s === 0.02")
     page.focus("button[aria-label='Delete start']")
     page.keyboard.press("Enter")
     page.wait_for_selector("#confirm-dialog[open]")

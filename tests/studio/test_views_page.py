@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from waiting import DEADLINE_S
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
@@ -277,17 +278,22 @@ def test_new_views_fit_width(visit, width):
 # -- previews ---------------------------------------------------------------------------------------------------------------
 
 
-def test_drag_shows_previews_and_then_everything(visit, monkeypatch):
+def test_drag_shows_previews_and_then_everything(visit, server, monkeypatch):
     from foveasim.config import build_shot
-    from foveasim.studio import _engine
+    from foveasim.studio import _engine, _session
 
     monkeypatch.setattr(_engine, "PREVIEW_CELLS", 1 << 14)
     page = visit()
+    (session,) = server.studio.sessions.values()
+    monkeypatch.setattr(_session, "REST_S", DEADLINE_S)
     page.evaluate("() => { studio.connection.set('optics.f_number', 4, false); }")
     status = "/^preview, /.test(document.getElementById('status').textContent.trim())"
     until(page, f"() => {status} && studio.views.parts.columns?.is_preview && studio.state.is_preview")
     # Without further changes the complete result follows.
-    until(page, "() => studio.isReady && !studio.connection.requests.isPreview && !studio.state.is_preview")
+    monkeypatch.setattr(_session, "REST_S", 0.0)
+    with session._wake:
+        session._wake.notify()
+    until(page, "() => studio.isIdle && !studio.connection.requests.isPreview && !studio.state.is_preview")
     assert "preview" not in page.inner_text("#status")
     set_value(page, "optics.f_number", 5.6)
     shot = build_shot(None, page.evaluate("studio.state.settings"))

@@ -1,5 +1,6 @@
 // Connection to the server: one WebSocket that reconnects, messages with numbers, and parts with arrays.
 
+import { awaited } from "./pending.js";
 import { WorkerSocket } from "./worker_socket.js";
 
 const TYPES = {
@@ -112,6 +113,12 @@ export class Connection {
     const now = () => { if (!this.socket && !this.isDenied) this.open(); };
     addEventListener("online", now);
     addEventListener("focus", now);
+  }
+
+  // Whether all messages are answered, and the page shows the last result, which no complete one follows.
+  get isAnswered() {
+    const { lastId, doneId, isPreview, waiting } = this.requests;
+    return this.isSettled && lastId > 0 && doneId >= lastId && !isPreview && waiting.length === 0 && this.unsent.size === 0;
   }
 
   // Whether all drafts are answered, and the server computes nothing.
@@ -275,7 +282,10 @@ export class Connection {
 
   // Sends a file to the server; returns { path } or { error }.
   /** @type {(file: File) => Promise<{ path?: string, error?: string }>} */
-  async upload(file) {
+  upload(file) { return awaited(this._upload(file)); }
+
+  /** @type {(file: File) => Promise<{ path?: string, error?: string }>} */
+  async _upload(file) {
     try {
       const answer = await fetch("/file?name=" + encodeURIComponent(file.name), { method: "POST", headers: this.headers, body: file });
       const found = await answer.json().catch(() => ({}));
@@ -287,7 +297,10 @@ export class Connection {
 
   // Returns the file of the current state as { blob } or { error }.
   /** @type {(what: string) => Promise<{ blob?: Blob, error?: string }>} */
-  async fetchFile(what) {
+  fetchFile(what) { return awaited(this._fetchFile(what)); }
+
+  /** @type {(what: string) => Promise<{ blob?: Blob, error?: string }>} */
+  async _fetchFile(what) {
     try {
       const answer = await fetch("/download?what=" + what, { headers: this.headers });
       if (answer.ok) return { blob: await answer.blob() };

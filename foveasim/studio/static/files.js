@@ -3,6 +3,7 @@
 import { $, download, downloadText, notice } from "/web/page_parts.js";
 import { fragmentOf, settingsOf, stateOf } from "./links.js";
 import { confirmed, copyText, listenToMenu, showText } from "./menus.js";
+import { awaited } from "./pending.js";
 import { isVideo } from "./sources.js";
 
 // How the server uses a file: by its name.
@@ -36,9 +37,10 @@ export class Files {
     $("link-form").addEventListener("submit", async (event) => {
       const text = $("link-text").value;
       $("link-text").value = "";
-      if (event.submitter?.getAttribute("value") === "open" && !(await this.openLink(text))) notice("The text is not a link of the studio");
+      if (event.submitter?.getAttribute("value") !== "open") return;
+      if (!(await awaited(this.openLink(text)))) notice("The text is not a link of the studio");
     });
-    addEventListener("hashchange", () => { if (connection.isOpen) this.openLink(location.hash); });
+    addEventListener("hashchange", () => { if (connection.isOpen) awaited(this.openLink(location.hash)); });
   }
 
   _listenToDrops() {

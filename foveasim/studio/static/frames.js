@@ -1,15 +1,19 @@
 // Work in the next frame of the browser, and sizes without a layout for each.
 
+import { begin } from "./pending.js";
+
 // Browsers may draw no frame for a long time, for example after their graphics process was busy: the work is then done anyway.
 const LATE_MS = 1000;
 
 /** @param {() => void} work */
 export function inNextFrame(work) {
   let isDone = false;
+  const end = begin();
   const once = () => {
     if (isDone) return;
     isDone = true;
     clearTimeout(timer);
+    end();
     work();
   };
   const timer = setTimeout(once, LATE_MS);

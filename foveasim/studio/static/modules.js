@@ -1,5 +1,7 @@
 // Modules of the page that are loaded when they are needed.
 
+import { awaited } from "./pending.js";
+
 /** @type {Map<string, number>} */
 const nFailed = new Map();
 
@@ -8,7 +10,7 @@ const nFailed = new Map();
 export async function load(path) {
   const n = nFailed.get(path) ?? 0;
   try {
-    return await import(path + (n ? "?attempt=" + (n + 1) : ""));
+    return await awaited(import(path + (n ? "?attempt=" + (n + 1) : "")));
   } catch (error) {
     nFailed.set(path, n + 1);
     throw error;

@@ -5,6 +5,7 @@ import { Camera, FIRST_SIZE, SIZES } from "./camera.js";
 import { Film, Rate } from "./film.js";
 import { FilmRow, rowButton } from "./film_row.js";
 import { listenToMenu } from "./menus.js";
+import { awaited } from "./pending.js";
 
 const VIDEO = /\.(mp4|m4v|mov|avi|mkv|webm|mpe?g|ogv|wmv|gif)$/i;
 const PICTURE = /\.(bmp|exr|hdr|jp2|jpe?g|png|ppm|tga|tiff?|webp)$/i;
@@ -208,7 +209,7 @@ export class Sources {
     const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
     const directory = entries.find((entry) => entry.isDirectory);
     if (directory) {
-      filesOf(directory).then((files) => this.openFolder(files), () => notice("The folder cannot be read"));
+      awaited(filesOf(directory)).then((files) => this.openFolder(files), () => notice("The folder cannot be read"));
       return true;
     }
     const files = [...transfer.files];
@@ -277,7 +278,7 @@ export class Sources {
   async startCamera() {
     if (this.camera.isOn || this.isStarting) return;
     this.isStarting = true;
-    const problem = await this.camera.start(() => { this.stopCamera(); notice("The camera was disconnected"); });
+    const problem = await awaited(this.camera.start(() => { this.stopCamera(); notice("The camera was disconnected"); }));
     this.isStarting = false;
     if (problem) { notice(problem); return; }
     this.film?.pause();

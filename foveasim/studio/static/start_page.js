@@ -3,6 +3,7 @@
 import { shown } from "/web/colours.js";
 import { $, make, notice } from "/web/page_parts.js";
 import { numberOf } from "./numbers.js";
+import { awaited } from "./pending.js";
 
 // Storage of the choice not to show the page at start.
 const STORED = "foveasim-studio-start", NEVER = "never";
@@ -73,7 +74,7 @@ export class StartPage {
     $("start-never").checked = stored.isNever;
     $("start-problem").textContent = problem;
     if (!this.root.open) this.root.showModal();
-    const contents = await this._read();
+    const contents = await awaited(this._read());
     if (contents) this._use(contents);
     else $("start-recent-note").textContent = "The server does not answer.";
   }

@@ -16,6 +16,7 @@ import { ImagePane } from "./image_pane.js";
 import { stateOf } from "./links.js";
 import { listenToDialogs } from "./menus.js";
 import { load } from "./modules.js";
+import { awaited, isPending } from "./pending.js";
 import { Problems } from "./problems.js";
 import { SitePane, useSoftware } from "./site_pane.js";
 import { Sources } from "./sources.js";
@@ -191,7 +192,7 @@ function receive(message, { isFailed }) {
   } else if (kind === "controls") controls.describe(message.controls);
   else if (kind === "done") finish(message);
   else if (kind === "error") { notice(message.text); views.made.sweep?.fail(message); }
-  else if (kind === "text") files.receiveText(message);
+  else if (kind === "text") awaited(files.receiveText(message));
   else if (kind === "gaze_path") gazePanel.usePath(message);
   else if (kind === "saved") notice("Saved as " + message.path);
   else if (kind === "sought") views.show("goal", true).then(() => views.made.goal?.show(message));
@@ -307,7 +308,7 @@ function hello(message, { isSame, isContinued }) {
     $("offer").hidden = false;
   }
   if (message.shows_start_page && message.is_new && !stored && stateOf(location.hash) === null) openStart({ isAtStart: true });
-  files.openLink(location.hash);
+  awaited(files.openLink(location.hash));
 }
 
 /** @type {Promise<import("./start_page.js").StartPage> | null} */
@@ -756,6 +757,13 @@ const studio = {
   get rules() { return views.made.rules?.list; },
   get solid() { return views.made.solid; },
   get isReady() { return Boolean(page.state && panes.b.scale && connection.isSettled && views.nLoading === 0 && page.asked === null); },
+  // Whether nothing more changes without the user: all messages are answered, their results are drawn, no timer of a result runs,
+  // and nothing is read or played. Later, the page may ask for fewer signals, and a sweep may have further points.
+  get isIdle() {
+    const films = [sources.film, gazePanel.film], isPlaying = films.some((film) => film && (film.isBusy || film.isPlaying));
+    return Boolean(this.isReady && connection.isAnswered && !isPending() && !page.holdTimer && !page.sizeTimer && !editor.pending
+      && !panes.b.overview?.resting && !isPlaying && !sources.camera.isOn);
+  },
   toWindow: (x, y, pane = "b") => {
     const canvas = panes[pane].marks, box = canvas.getBoundingClientRect(), view = panes[pane].view ? panes[pane].view() : panes[pane].map;
     const [px, py] = panes[pane].place || [0, 0];

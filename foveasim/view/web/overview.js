@@ -30,10 +30,11 @@ export class Overview {
   // Draws the view now, or hides the picture until the view rests.
   update(map, scale, range) {
     clearTimeout(this.resting);
+    this.resting = 0;
     this.canvas.hidden = true;
     if (!this.isNeeded(map)) return;
     if (this.ms < FRAME_MS) this.draw(map, scale, range);
-    else this.resting = setTimeout(() => this.draw(map, scale, range), REST_MS);
+    else this.resting = setTimeout(() => { this.resting = 0; this.draw(map, scale, range); }, REST_MS);
   }
 
   // Whether there are sites of a few pixels only.
