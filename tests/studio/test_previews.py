@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 
 import numpy as np
 import pytest
 from PIL import Image
+from waiting import DEADLINE_S, wait_until
 
 from foveasim.config import build_shot
 from foveasim.studio import _engine, _session
@@ -198,7 +198,7 @@ class Listener:
             self.messages.append(decode_part(message)[0] if isinstance(message, bytes) else json.loads(message))
             self.event.notify_all()
 
-    def wait(self, condition, timeout_s=60.0):
+    def wait(self, condition, timeout_s=DEADLINE_S):
         with self.event:
             assert self.event.wait_for(lambda: any(map(condition, self.messages)), timeout_s)
 
@@ -235,10 +235,11 @@ def test_rest_releases_unused_memory(settings, make_threaded, monkeypatch):
     session = make_threaded(settings)
     for number in (1, 2):
         session.post({"do": "set", "key": "seed", "value": number, "final": True})
-        assert released.wait(60.0), number
+        assert released.wait(DEADLINE_S), number
         released.clear()
 
-    assert not released.wait(0.3)  # only once in each rest
+    # Once in each rest: the thread next wakes up to forget its result.
+    assert session._rest_s == _session.FORGET_S
 
 
 def test_complete_result_releases_memory(large, make_threaded, monkeypatch):
@@ -250,7 +251,7 @@ def test_complete_result_releases_memory(large, make_threaded, monkeypatch):
     session.post({"do": "set", "key": "optics.f_number", "value": 4.0, "final": False, "id": 5})
     listener.wait(lambda m: m.get("kind") == "done" and m["id"] == 5 and not m["is_preview"])
 
-    assert released.wait(60.0)
+    assert released.wait(DEADLINE_S)
 
 
 # -- interruption -----------------------------------------------------------------------------------------------------------
@@ -261,9 +262,9 @@ def test_closing_stops_the_simulation(settings, make_threaded, monkeypatch):
     monkeypatch.setattr(Session, "_check", slowly(Session._check, is_started))
     session = make_threaded(settings)
     session.post({"do": "refresh"})
-    assert is_started.wait(60.0)
+    assert is_started.wait(DEADLINE_S)
     session.close()
-    session._thread.join(60.0)
+    session._thread.join(DEADLINE_S)
 
     assert session.result is None
     assert not session.uploads.exists()
@@ -274,10 +275,7 @@ def slowly(check, is_started):
 
     def wait(session, stage):
         is_started.set()
-        for _ in range(6000):
-            if session._is_closed:
-                break
-            time.sleep(0.01)
+        wait_until(lambda: session._is_closed)
         check(session, stage)
 
     return wait
@@ -304,21 +302,22 @@ def test_newer_change_stops_a_simulation(settings, make_threaded, monkeypatch):
     session = make_threaded(settings)
     listener = Listener(session)
     listener.wait(lambda m: m.get("kind") == "done")
-    started = threading.Event()
+    started, has_newer = threading.Event(), threading.Event()
     stages = []
     make = session.engine._runner.check
 
     def slow_check(stage):
-        stages.append(time.monotonic())
+        stages.append(stage)
         started.set()
-        time.sleep(0.2)
+        assert has_newer.wait(DEADLINE_S)
         make(stage)
 
     session.engine._runner.check = slow_check
     session.post({"do": "set", "key": "optics.f_number", "value": 4.0, "final": True, "id": 1})
-    assert started.wait(30.0)
+    assert started.wait(DEADLINE_S)
     n_before = len(stages)
     session.post({"do": "set", "key": "sensor.bits", "value": 8, "final": True, "id": 2})
+    has_newer.set()
     listener.wait(lambda m: m.get("kind") == "done" and m["id"] == 2)
 
     states = [m for m in listener.messages if m.get("kind") == "state" and m["id"] in (1, 2)]

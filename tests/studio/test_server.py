@@ -10,7 +10,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 import pytest
 import websockets
 import yaml
+from waiting import DEADLINE_S, wait_until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import foveasim as fs
@@ -29,7 +29,7 @@ from foveasim.studio._messages import decode_part
 from foveasim.studio._server import HEADERS, Studio, host_names, other_addresses, serve
 from foveasim.studio._session import Start
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = DEADLINE_S
 #: Open connections of a test.
 CONNECTIONS = []
 
@@ -296,11 +296,9 @@ def test_tabs_have_separate_sessions(served, settings):
 def test_short_messages_do_not_wait(served):
     """Nagle's algorithm would hold a short message after a large one until that is acknowledged."""
     with socket.create_connection(("127.0.0.1", served.port)):
-        end_s = time.monotonic() + TIMEOUT_S
-        while not (found := list(served.studio.unauthenticated._transports.values())):
-            assert time.monotonic() < end_s
-            time.sleep(0.01)
-        connection = found[0].get_extra_info("socket")
+        connection = wait_until(lambda: list(served.studio.unauthenticated._transports.values()))[0].get_extra_info(
+            "socket"
+        )
 
         assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
 
@@ -322,7 +320,7 @@ def test_duplicated_tab_has_a_copy(served, settings, tmp_path):
         await one.do(do="set", key="exposure_s", value=0.03, final=True)
         await two.do(do="set", key="seed", value=8, final=True)
         await one.connection.close()
-        await asyncio.sleep(0.3)
+        await asyncio.to_thread(wait_until, lambda: served.studio.sessions[name].is_idle)
         again = await opened(served, name, page="three")  # the page was loaded again
         for page in (two, again):
             await page.connection.close()
@@ -349,7 +347,8 @@ def test_sessions_are_limited_and_freed(served, monkeypatch):
         with pytest.raises(ConnectionClosed) as caught:
             await opened(served)
         await pages[0].connection.close()
-        await asyncio.sleep(0.3)
+        session = served.studio.sessions[pages[0].hello["session"]]
+        await asyncio.to_thread(wait_until, lambda: session.is_idle)
         third = await opened(served)
         names = set(served.studio.sessions)
         for page in (*pages, third):
@@ -359,8 +358,8 @@ def test_sessions_are_limited_and_freed(served, monkeypatch):
     code, names, pages, third = run(visit())
     assert code == 4429
     assert names == {pages[1].hello["session"], third.hello["session"]}
-    time.sleep(0.3)
-    served.studio.free_idle(0.0)
+    wait_until(lambda: all(session.is_idle for session in served.studio.sessions.values()))
+    served.studio.free_idle(-1.0)
     assert served.studio.sessions == {}
 
 

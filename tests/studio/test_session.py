@@ -6,7 +6,6 @@ import copy
 import gc
 import json
 import threading
-import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from typer.testing import CliRunner
+from waiting import DEADLINE_S, wait_until
 
 import foveasim as fs
 from foveasim._io.images import write_picture
@@ -634,13 +634,6 @@ def test_text_without_format_gives_one_line(recorder):
     assert [(m["id"], m["text"]) for m in recorder.messages if m["kind"] == "error"] == [(4, "'what' must be a string")]
 
 
-def wait_until(condition, timeout_s=20.0):
-    end_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
-
-
 def test_thread_survives_unexpected_exceptions(settings, monkeypatch):
     session = Session("threaded", Start(settings), n_threads=1)
     messages = []
@@ -689,7 +682,8 @@ def test_session_without_page_releases_its_results(settings, monkeypatch):
         results = [session.result, session._frozen_result, *(found for _, found in session._compared.values())]
         captures = [weakref.ref(each.capture) for each in results]
         del results
-        time.sleep(0.3)
+        # Its thread has nothing more to do.
+        wait_until(lambda: session._rest_s is None)
         assert session.result is not None
         session.detach(messages.append)
         wait_until(lambda: session.result is None and all(each() is None for each in captures))
@@ -724,8 +718,10 @@ def test_signals_are_sent_when_requested(recorder):
 def test_slow_views_wait_for_the_page(settings, monkeypatch):
     """Until the page has drawn the photosites, or a newer message waits."""
     monkeypatch.setattr(_views, "AWAITED_S", -1.0)
-    monkeypatch.setattr(_session, "DRAWN_S", 20.0)
-    session, parts = Session("threaded", Start(settings), n_threads=1), []
+    monkeypatch.setattr(_session, "DRAWN_S", DEADLINE_S)
+    session, parts, waits = Session("threaded", Start(settings), n_threads=1), [], threading.Event()
+    wait_for_page = session._views._wait_for_page
+    session._views._wait_for_page = lambda: (waits.set(), wait_for_page())
 
     def listen(message):
         if isinstance(message, bytes):
@@ -736,15 +732,16 @@ def test_slow_views_wait_for_the_page(settings, monkeypatch):
 
     try:
         session.attach(listen, answers=True)
-        wait_until(lambda: "columns" in names())
-        time.sleep(0.1)
+        assert waits.wait(DEADLINE_S)
         assert names() == ["sites", "columns"]
         assert [header.get("is_awaited", False) for header in parts] == [False, True]
         session.post({"do": "drawn", "version": parts[-1]["version"]})
         wait_until(lambda: "picture" in names())
         parts.clear()
+        waits.clear()
         session.post({"do": "set", "key": "exposure_s", "value": 0.02, "final": True})
-        wait_until(lambda: "columns" in names())
+        assert waits.wait(DEADLINE_S)
+        assert "columns" in names()
         assert "picture" not in names()
         session.post({"do": "set", "key": "exposure_s", "value": 0.03, "final": True})
         wait_until(lambda: names().count("columns") == 2)

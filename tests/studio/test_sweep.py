@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import time
 
 import numpy as np
 import pytest
 import yaml
 from studio.conftest import SETTINGS
 from typer.testing import CliRunner
+from waiting import wait_until
 
 from foveasim import explore
 from foveasim.cli import app
@@ -227,10 +227,7 @@ def test_thread_computes_points_between_messages(settings):
         session.attach(lambda message: None if isinstance(message, bytes) else messages.append(yaml.safe_load(message)))
         session.post({"do": "sweep", "settings": [EXPOSURES, F_NUMBERS], "results": [CODE], "id": 1})
         session.post({"do": "set", "key": "exposure_s", "value": 0.03, "id": 2})
-        end_s = time.monotonic() + 60.0
-        while not any(message.get("state") == "done" for message in messages):
-            assert time.monotonic() < end_s
-            time.sleep(0.01)
+        wait_until(lambda: any(message.get("state") == "done" for message in list(messages)))
         assert session.history.settings["exposure_s"] == 0.03
     finally:
         session.close()
