@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,6 +15,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from waiting import wait_until
 
 import foveasim
 from foveasim._core import jit
@@ -133,21 +133,25 @@ def test_kernels_are_distinguished_by_the_fewest_arrays():
 
 
 def test_threads_compile_a_kernel_once(monkeypatch):
-    compiled = []
+    asked, compiled = [], []
 
-    def compile_slowly(function, *_):
+    def compile_late(function, *_):
         compiled.append(function.__name__)
-        time.sleep(0.05)
+        wait_until(lambda: len(asked) == 8)
         return function
 
-    monkeypatch.setattr(jit, "_compile", compile_slowly)
+    monkeypatch.setattr(jit, "_compile", compile_late)
 
     @njit(numba.int64(numba.int64))
     def double(x):
         return 2 * x
 
+    def ask(x):
+        asked.append(x)
+        return double(x)
+
     with ThreadPoolExecutor(8) as pool:
-        assert list(pool.map(double, range(8))) == list(range(0, 16, 2))
+        assert list(pool.map(ask, range(8))) == list(range(0, 16, 2))
     assert compiled == ["double"]
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import copy
 import pickle
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from waiting import wait_until
 
 from foveasim.sensor.bounded_cache import BoundedCache
 
@@ -56,15 +56,19 @@ def test_values_may_use_other_values():
 
 
 def test_threads_share_computation():
-    cache, calls = BoundedCache(4), []
+    cache, asked, calls = BoundedCache(4), [], []
 
     def compute():
-        time.sleep(0.01)
+        wait_until(lambda: len(asked) == 8)
         calls.append(0)
         return object()
 
+    def ask(number):
+        asked.append(number)
+        return id(cache.get("key", compute))
+
     with ThreadPoolExecutor(8) as pool:
-        found = set(pool.map(lambda _: id(cache.get("key", compute)), range(50)))
+        found = set(pool.map(ask, range(50)))
 
     assert len(found) == len(calls) == 1
 
