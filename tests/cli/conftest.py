@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import warnings
+from functools import partial
 
 import pytest
 
@@ -12,24 +13,25 @@ from foveasim import cli
 from foveasim._io.terminal import PlainConsole
 
 
+def run_here(patch, read, *arguments, cwd, **environment):
+    """Run the program in a directory; return exit code, standard output and standard error, as of a wide terminal."""
+    read()
+    with patch.context() as here, warnings.catch_warnings():
+        warnings.simplefilter("default")
+        here.chdir(cwd)
+        here.setattr(sys, "argv", ["foveasim", *arguments])
+        here.setattr(sys, "path", list(sys.path))
+        for name, value in {"COLUMNS": "200", **environment}.items():
+            here.setenv(name, value)
+        here.setattr(cli, "console", PlainConsole())
+        here.setattr(cli, "error_console", PlainConsole(stderr=True))
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+    printed = read()
+    return subprocess.CompletedProcess(arguments, ended.value.code or 0, printed.out, printed.err)
+
+
 @pytest.fixture
 def foveasim(monkeypatch, capsys):
-    """Run the program in a directory; return exit code, standard output and standard error, as of a wide terminal."""
-
-    def run(*arguments, cwd, **environment):
-        capsys.readouterr()
-        with monkeypatch.context() as patch, warnings.catch_warnings():
-            warnings.simplefilter("default")
-            patch.chdir(cwd)
-            patch.setattr(sys, "argv", ["foveasim", *arguments])
-            patch.setattr(sys, "path", list(sys.path))
-            for name, value in {"COLUMNS": "200", **environment}.items():
-                patch.setenv(name, value)
-            patch.setattr(cli, "console", PlainConsole())
-            patch.setattr(cli, "error_console", PlainConsole(stderr=True))
-            with pytest.raises(SystemExit) as ended:
-                cli.main()
-        printed = capsys.readouterr()
-        return subprocess.CompletedProcess(arguments, ended.value.code or 0, printed.out, printed.err)
-
-    return run
+    """Return a function that runs the program in this process."""
+    return partial(run_here, monkeypatch, capsys.readouterr)

@@ -14,8 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from programs import run_program
 
 import foveasim as fs
+from foveasim import config
 from foveasim._io.images import read_picture
 from foveasim.config import bundled_layouts
 from foveasim.view import find_renderer
@@ -26,12 +28,6 @@ optics: {focal_length_mm: 8, f_number: 2.8}
 layout: {generator: grid, parameters: {n_x: 20, n_y: 20, pitch_um: 3}}
 exposure_s: 0.01
 """
-
-
-def run_program(*arguments, cwd):
-    """Run the program as users do, in a process of its own."""
-    command = [sys.executable, "-m", "foveasim.cli", *arguments]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
 
 
 def huge_png(png):
@@ -48,16 +44,11 @@ def folder(tmp_path):
     return tmp_path
 
 
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("demo")
-    return folder / "out", run_program("demo", "-o", "out", cwd=folder)
-
-
-def test_demo_writes_its_files(demo):
-    out, result = demo
+def test_demo_writes_pictures_and_table(foveasim, tmp_path):
+    result = foveasim("demo", "-o", "out", cwd=tmp_path)
 
     assert result.returncode == 0, result.stderr
+    out = tmp_path / "out"
     names = [
         f"{shot}_{what}" for shot in ("four_zones", "foveal") for what in ("capture.npz", "layout.png", "picture.png")
     ]
@@ -66,11 +57,11 @@ def test_demo_writes_its_files(demo):
     assert sorted(p.name for p in out.iterdir()) == sorted(names)
     for word in ("14,208", "13,312", "blind-spot radius", "60.12", "saturated", "optics / s"):
         assert word in result.stdout
+    check_upright_picture_with_blind_spot(out)
 
 
-def test_demo_picture_is_upright_with_blind_spot(demo):
+def check_upright_picture_with_blind_spot(out):
     """The picture correlates with the photograph, and not with its mirror images."""
-    out, _ = demo
     seen = read_picture(out / "foveal_picture.png").astype(float)
     capture = fs.Capture.load(out / "foveal_capture.npz")
     photograph = read_picture(str(files("skimage.data") / "astronaut.png")).astype(float)
@@ -90,8 +81,8 @@ def test_demo_picture_is_upright_with_blind_spot(demo):
     assert not seen[505:519, 505:519, 3].any()
 
 
-def test_run_writes_capture_of_settings(folder):
-    result = run_program("run", "shot.yaml", "--set", "sensor.bits=12", "--set", "seed=4", "-o", "out", cwd=folder)
+def test_run_writes_capture_of_settings(foveasim, folder):
+    result = foveasim("run", "shot.yaml", "--set", "sensor.bits=12", "--set", "seed=4", "-o", "out", cwd=folder)
     capture = fs.Capture.load(folder / "out" / "shot_capture.npz")
 
     assert result.returncode == 0, result.stderr
@@ -168,11 +159,12 @@ source: made for this test
 """
 
 
-def test_exit_code_reports_rule_violations(tmp_path):
+def test_exit_code_reports_rule_violations(foveasim, tmp_path):
+    """That of the program as users run it, in a process of its own."""
     (tmp_path / "rings.yaml").write_text(LAYOUT)
     (tmp_path / "loose.yaml").write_text("min_size_um: 0.1\n")
     broken = run_program("check", "rings.yaml", "--report", "rings.lyrdb", cwd=tmp_path)
-    kept = run_program("check", "rings.yaml", "--rules", "loose.yaml", cwd=tmp_path)
+    kept = foveasim("check", "rings.yaml", "--rules", "loose.yaml", cwd=tmp_path)
 
     assert broken.returncode == 1
     assert "fail" in broken.stdout
@@ -223,15 +215,16 @@ def test_invalid_layout_files_print_one_line(foveasim, tmp_path, arguments, word
     ("layout", "radius"),
     [
         (
-            "{generator: log_polar, parameters: {n_sectors: 32, r_min_um: 10, r_max_um: 90}, move_um: [5.0, 3.0]}",
+            "{generator: log_polar, parameters: {n_sectors: 32, r_min_um: 10, r_max_um: 40}, move_um: [5.0, 3.0]}",
             "10.00",
         ),
-        ("{generator: giotto, parameters: {n_rho: 12, n_theta: 40, n_fovea: 5, n_across: 40, unit_um: 4}}", "none"),
-        ("{generator: fovi, parameters: {fov_um: 200, a_um: 10, n_rings: 12}}", "none"),
+        ("{generator: giotto, parameters: {n_rho: 6, n_theta: 16, n_fovea: 3, n_across: 16, unit_um: 4}}", "none"),
+        ("{generator: fovi, parameters: {fov_um: 80, a_um: 10, n_rings: 5}}", "none"),
         ("{generator: grid, parameters: {n_x: 9, n_y: 9, pitch_um: 5}}", "none"),
     ],
 )
-def test_blind_spot_is_central_hole_only(foveasim, tmp_path, layout, radius):
+def test_blind_spot_is_central_hole_only(foveasim, tmp_path, monkeypatch, layout, radius):
+    monkeypatch.setattr(sys.modules[config.run_shot.__module__], "write_results", lambda *_: ([], 0.0))
     scene = (
         "{kind: flat, shape: [400, 400], pitch_um: 100, distance_m: 1.0, radiance_w_m2_sr_nm: 0.1, band_width_nm: 10}"
     )
@@ -243,13 +236,17 @@ def test_blind_spot_is_central_hole_only(foveasim, tmp_path, layout, radius):
     assert line.split("│")[2].strip() == radius
 
 
-@pytest.mark.slow
-def test_layouts_lists_bundled_layouts(foveasim, tmp_path):
+def test_layouts_lists_bundled_layouts(foveasim, tmp_path, monkeypatch):
+    small, read, large = tmp_path / "small.yaml", config.read_layout_file, {"bayer_grid", "giotto_2", "pixirad_1"}
+    monkeypatch.setattr(config, "read_layout_file", lambda path: read(small if path.stem in large else path))
+    small.write_text("generator: grid\nparameters: {n_x: 111, n_y: 37, pitch_um: 2.0}\n")
     result = foveasim("layouts", cwd=tmp_path)
 
     assert result.returncode == 0, result.stderr
     assert all(name in result.stdout for name in bundled_layouts())
-    assert "243,712" in result.stdout
+    rows = [row.split() for row in result.stdout.splitlines()]
+    assert ["pixirad_1", "4,107", "222", "x", "74", "2", "grid"] in rows
+    assert ["four_zones", "13,312"] in [row[:2] for row in rows]
     printed = " ".join(result.stdout.split())
     for path in bundled_layouts().values():
         first_line = path.read_text(encoding="utf-8").splitlines()[0]

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import os
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from programs import run_programs
 
 import foveasim as fs
 
@@ -36,13 +35,6 @@ SHOT = {
 }
 #: An ASCII-only terminal, as in a container without locales, whatever Python would make of it.
 ASCII = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii:strict", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-
-
-def run_program(*arguments, cwd, **environment):
-    """Return exit code, standard output and standard error as bytes, as of a wide terminal."""
-    command = [sys.executable, "-m", "foveasim.cli", *arguments]
-    env = {**os.environ, "COLUMNS": "200", **environment}
-    return subprocess.run(command, cwd=cwd, env=env, capture_output=True, check=False)
 
 
 def is_clean(result):
@@ -151,10 +143,14 @@ def test_control_characters_are_escaped(foveasim, tmp_path):
 def test_names_outside_utf8_are_escaped(tmp_path):
     name = os.fsdecode(b"$caf\xe9$^.yaml")
     (tmp_path / name).write_text(yaml.safe_dump(SHOT))
-    ran = run_program("run", name, "-o", "out", cwd=tmp_path)
-    failed = run_program("describe", name + "x", cwd=tmp_path)
     capture = os.fsdecode(b"out/$caf\xe9$^_capture.npz")
-    viewed = run_program("view", capture, "--out", "page.html", cwd=tmp_path)
+    ran, failed, viewed = run_programs(
+        ("run", name, "-o", "out"),
+        ("describe", name + "x"),
+        ("view", capture, "--out", "page.html"),
+        cwd=tmp_path,
+        COLUMNS="200",
+    )
 
     assert ran.returncode == 0, ran.stderr
     assert rb"wrote out/$caf\udce9$^_capture.npz" in ran.stdout
@@ -163,26 +159,31 @@ def test_names_outside_utf8_are_escaped(tmp_path):
     assert failed.stderr == rb"error: $caf\udce9$^.yamlx: no such file; did you mean '$caf\udce9$^.yaml'?" + b"\n"
 
 
-@pytest.mark.slow(keep=1)
-@pytest.mark.parametrize(
-    ("arguments", "code", "printed"),
-    [
-        (("layouts",), 0, b"field / um"),
-        (("describe", "four_zones"), 0, b"mm2"),
-        (("check", "rings.yaml"), 1, b"fail"),
-        (("convert", "rings.yaml", "rings.svg"), 0, b"moved by at most 6.4e-05 um"),
-        (("run", "shot.yaml", "-o", "out"), 0, b"smallest site / um"),
-        (("video", "picture.yaml", "--frames", "frames", "-o", "seen.gif"), 0, b"2 frames"),
-        (("view", "shot.yaml", "--out", "page.html"), 2, b"error: shot.yaml"),
-        (("describe", "\u00e9\u00b5.yaml"), 2, b"error: "),
-        (("--help",), 0, b"Usage"),
-        (("run", "--help"), 0, b"Usage"),
-        (("run", "--bad"), 2, b"Usage"),
-        (("schema",), 0, b"title"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
-)
-def test_ascii_terminals_get_plain_characters(tmp_path, arguments, code, printed):
+#: Commands with their exit codes, and what they print on an ASCII-only terminal.
+ON_ASCII = [
+    (("layouts",), 0, b"field / um"),
+    (("describe", "four_zones"), 0, b"mm2"),
+    (("check", "rings.yaml"), 1, b"fail"),
+    (("convert", "rings.yaml", "rings.svg"), 0, b"moved by at most 6.4e-05 um"),
+    (("run", "shot.yaml", "-o", "out"), 0, b"smallest site / um"),
+    (("video", "picture.yaml", "--frames", "frames", "-o", "seen.gif"), 0, b"2 frames"),
+    (("view", "shot.yaml", "--out", "page.html"), 2, b"error: shot.yaml"),
+    (("describe", "\u00e9\u00b5.yaml"), 2, b"error: "),
+    (("--help",), 0, b"Usage"),
+    (("run", "--help"), 0, b"Usage"),
+    (("run", "--bad"), 2, b"Usage"),
+    (("schema",), 0, b"title"),
+]
+#: The list of all bundled layouts takes seconds.
+FEW_LAYOUTS = """
+from foveasim import config
+
+few = {name: path for name, path in config.bundled_layouts().items() if name.startswith("prima")}
+config.bundled_layouts = lambda: few
+"""
+
+
+def test_ascii_terminals_get_plain_characters(tmp_path):
     rings = {"generator": "log_polar", "parameters": {"n_sectors": 16, "r_min_um": 2.0, "r_max_um": 20.0}}
     (tmp_path / "rings.yaml").write_text(yaml.safe_dump({**rings, "rules": {"min_size_um": 1.0}}))
     (tmp_path / "shot.yaml").write_text(yaml.safe_dump(SHOT))
@@ -197,12 +198,14 @@ def test_ascii_terminals_get_plain_characters(tmp_path, arguments, code, printed
     (tmp_path / "frames").mkdir()
     for k in range(2):
         Image.new("RGB", (60, 60), (90 * k, 9, 9)).save(tmp_path / "frames" / f"{k}.png")
-    result = run_program(*arguments, cwd=tmp_path, **ASCII)
+    commands = [arguments for arguments, _, _ in ON_ASCII]
+    results = run_programs(*commands, cwd=tmp_path, before=FEW_LAYOUTS, COLUMNS="200", **ASCII)
 
-    assert is_clean(result), result.stderr
-    assert result.returncode == code, result.stderr
-    assert printed in result.stdout + result.stderr
-    assert (result.stdout + result.stderr).isascii()
+    for (arguments, code, printed), result in zip(ON_ASCII, results, strict=True):
+        assert is_clean(result), (arguments, result.stderr)
+        assert result.returncode == code, (arguments, result.stderr)
+        assert printed in result.stdout + result.stderr, arguments
+        assert (result.stdout + result.stderr).isascii(), arguments
 
 
 def test_spinner_is_plain_on_ascii_terminals():
