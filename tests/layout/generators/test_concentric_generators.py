@@ -34,7 +34,7 @@ def assert_tiles(layout):
     assert bool(np.all(shapely.is_valid(polygons)))
     assert bool(shapely.coverage_is_valid(polygons))
     assert common_um2.max(initial=0.0) <= 1e-9 * layout.area_um2.min()
-    assert layout.area_um2.sum() == pytest.approx(shapely.union_all(polygons).area, rel=1e-9)
+    assert layout.area_um2.sum() == pytest.approx(covered(layout).area, rel=1e-9)
 
 
 def covered(layout):
@@ -173,9 +173,10 @@ def test_giotto_tiles_disc_or_annulus(parameters):
     disc_um2 = regular_polygon_um2(n_corners, 0.5 * parameters["n_across"] * parameters["unit_um"])
     blind_um2 = regular_polygon_um2(n_corners, (parameters["n_fovea"] - 0.5) * parameters["unit_um"])
     has_blind_spot = parameters["fovea"] == "none"
+    union = covered(layout)
 
     assert_tiles(layout)
-    assert (covered(layout).geom_type, len(covered(layout).interiors)) == ("Polygon", int(has_blind_spot))
+    assert (union.geom_type, len(union.interiors)) == ("Polygon", int(has_blind_spot))
     assert layout.area_um2.sum() == pytest.approx(disc_um2 - has_blind_spot * blind_um2, rel=1e-9)
 
 
@@ -190,19 +191,26 @@ def test_giotto_neighbours_share_edges_exactly(parameters):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("chords_per_arc", [1, 2, 3, 4, 7])
-@pytest.mark.parametrize("stagger", [False, True])
-@pytest.mark.parametrize("fovea", ["rings", "none"])
+@pytest.mark.parametrize(
+    ("fovea", "stagger", "chords_per_arc"),
+    [
+        ("rings", True, 1),
+        ("rings", True, 4),
+        ("rings", False, 3),
+        ("none", True, 2),
+        ("none", True, 7),
+        ("none", False, 4),
+    ],
+)
 def test_giotto_1_tiles_with_any_chords(fovea, stagger, chords_per_arc):
     parameters = {**GIOTTO_1, "unit_um": 3.0, "fovea": fovea, "stagger": stagger, "chords_per_arc": chords_per_arc}
     layout = giotto(**parameters)
     n_corners = outer_corners(parameters)
+    union = covered(layout)
 
     assert_tiles(layout)
-    assert len(covered(layout).interiors) == (fovea == "none")
-    assert covered(layout).exterior.length == pytest.approx(
-        n_corners * 2 * 900.0 * math.sin(math.pi / n_corners), rel=1e-9
-    )
+    assert len(union.interiors) == (fovea == "none")
+    assert union.exterior.length == pytest.approx(n_corners * 2 * 900.0 * math.sin(math.pi / n_corners), rel=1e-9)
 
 
 @given(st.integers(1, 12), st.integers(3, 9), st.integers(0, 50))
@@ -337,14 +345,15 @@ def half_sides_um(n_rings, ring_ratio, pitch_um, n_fovea=1):
 
 
 @given(foveal_parameters())
-@settings(relaxed, max_examples=examples(80))
+@relaxed
 def test_foveal_cartesian_tiles_its_square(parameters):
     layout = foveal_cartesian(**parameters)
     half_um = half_sides_um(**parameters)[-1]
+    union = covered(layout)
 
     assert layout.n_sites == (2 * parameters["n_rings"] - 1) ** 2
     assert_tiles(layout)
-    assert (covered(layout).geom_type, len(covered(layout).interiors)) == ("Polygon", 0)
+    assert (union.geom_type, len(union.interiors)) == ("Polygon", 0)
     assert layout.area_um2.sum() == pytest.approx(4 * half_um**2, rel=1e-9)
     assert layout.bounds_um == pytest.approx((-half_um, -half_um, half_um, half_um), rel=1e-12)
 
@@ -475,12 +484,13 @@ def octagonal_parameters(draw):
 
 
 @given(octagonal_parameters())
-@settings(relaxed, max_examples=examples(60))
+@relaxed
 def test_octagons_and_diamonds_tile_without_holes(parameters):
     layout = octagonal(**parameters)
+    union = covered(layout)
 
     assert_tiles(layout)
-    assert (covered(layout).geom_type, len(covered(layout).interiors)) == ("Polygon", 0)
+    assert (union.geom_type, len(union.interiors)) == ("Polygon", 0)
 
 
 @given(octagonal_parameters())
@@ -578,34 +588,33 @@ def test_octagonal_rejects_invalid_parameters(changed, message):
 # -- all families ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "parameters", "n_sites", "area_um2"),
     [
         pytest.param(
             giotto,
-            {"n_rho": 700, "n_theta": 2000, "n_fovea": 330, "n_across": 5000, "unit_um": 1.0},
-            1 + 6 * 330 * 329 // 2 + 370 * 2000,
-            regular_polygon_um2(4000, 2500.0),
+            {"n_rho": 220, "n_theta": 640, "n_fovea": 100, "n_across": 1600, "unit_um": 1.0},
+            1 + 6 * 100 * 99 // 2 + 120 * 640,
+            regular_polygon_um2(1280, 800.0),
             id="giotto",
         ),
         pytest.param(
             foveal_cartesian,
-            {"n_rings": 500, "ring_ratio": 1.01, "pitch_um": 2.0, "n_fovea": 100},
-            999**2,
-            (2 * 99.5 * 2.0 * 1.01**400) ** 2,
+            {"n_rings": 160, "ring_ratio": 1.03, "pitch_um": 2.0, "n_fovea": 30},
+            319**2,
+            (2 * 29.5 * 2.0 * 1.03**130) ** 2,
             id="foveal Cartesian",
         ),
         pytest.param(
             octagonal,
-            {"n_x": 710, "n_y": 700, "pitch_um": 2.0, "border": "cut"},
-            710 * 700 + 711 * 701,
-            710 * 700 * 4.0,
+            {"n_x": 230, "n_y": 220, "pitch_um": 2.0, "border": "cut"},
+            230 * 220 + 231 * 221,
+            230 * 220 * 4.0,
             id="octagonal",
         ),
     ],
 )
-def test_million_sites_have_expected_area(make, parameters, n_sites, area_um2):
+def test_100000_sites_have_expected_area(make, parameters, n_sites, area_um2):
     layout = make(**parameters)
 
     assert layout.n_sites == n_sites

@@ -54,7 +54,7 @@ def assert_tiles(layout, region_um2):
     assert bool((layout.area_um2 > 0).all())
     assert common_um2.max(initial=0.0) <= 1e-9 * layout.area_um2.min()
     assert layout.area_um2.sum() == pytest.approx(region_um2, rel=1e-9)
-    assert shapely.union_all(polygons).area == pytest.approx(region_um2, rel=1e-9)
+    assert shapely.coverage_union_all(polygons).area == pytest.approx(region_um2, rel=1e-9)
 
 
 def assert_same(one, other):
@@ -143,7 +143,7 @@ def test_separated_part_is_assigned_to_neighbour():
 
 @given(st.sampled_from([NOTCH, STAR]), st.integers(8, 80), seeds)
 # About one in six of these layouts has exactly one separated part.
-@settings(relaxed, max_examples=examples(60), suppress_health_check=[HealthCheck.filter_too_much])
+@settings(relaxed, max_examples=examples(36), suppress_health_check=[HealthCheck.filter_too_much])
 def test_separated_part_joins_longest_shared_boundary(region, n, seed):
     """The reference cells are those of shapely, for layouts with one separated part."""
     centres = points_in(region, n, seed)
@@ -172,11 +172,10 @@ def test_cells_tile_region_with_hole():
     assert_tiles(layout, 400 - 64)
 
 
-@pytest.mark.slow
-def test_100000_cells_tile():
-    layout = as_layout(*voronoi_cells(points_in(BOX, 100_000, 2), BOX))
+def test_10000_cells_tile():
+    layout = as_layout(*voronoi_cells(points_in(BOX, 10_000, 2), BOX))
 
-    assert layout.n_sites == 100_000
+    assert layout.n_sites == 10_000
     assert layout.area_um2.sum() == pytest.approx(BOX.area, rel=1e-12)
     assert bool(shapely.coverage_is_valid(layout.polygons()))
 
@@ -208,13 +207,13 @@ def areas_um2(edges, n):
 
 
 @pytest.mark.slow
-@given(st.sampled_from([BOX, NOTCH, STAR, FRAME]), st.integers(5, 120), st.sampled_from([0.05, 0.3, 1.0]), seeds)
-@relaxed
+@given(st.sampled_from([BOX, NOTCH, STAR, FRAME]), st.integers(5, 80), st.sampled_from([0.05, 0.3, 1.0]), seeds)
+@settings(relaxed, max_examples=examples(20))
 def test_updated_cells_equal_new_cells(region, n, step_fraction, seed):
     """Including cells divided by notches, and both small and large displacements of centres."""
     centres, targets = points_in(region, n, seed), points_in(region, n, seed + 1)
     cells = IncrementalCells(region)
-    for _ in range(4):
+    for _ in range(3):
         edges = cells.update(centres)
         expected = as_layout(*voronoi_cells(centres, region)) if region is not FRAME else None
         tolerance_um2 = 1e-9 * region.area / n
@@ -298,8 +297,8 @@ def test_shared_edges_are_paired():
 
 
 @pytest.mark.slow
-@given(st.floats(10.0, 5000.0), st.floats(1e-3, 1e3), st.integers(1, 25))
-@relaxed
+@given(st.floats(10.0, 5000.0), st.floats(1e-3, 1e3), st.integers(1, 20))
+@settings(relaxed, max_examples=examples(15))
 def test_foveal_rings_tile_disc_without_blind_spot(fov_um, a_fraction, n_rings):
     assume(n_rings > 1 or a_fraction > 0.1)
     layout = fovi(fov_um=fov_um, a_um=a_fraction * fov_um, n_rings=n_rings, n_chords=1000)
@@ -460,12 +459,11 @@ def test_density_driven_sites_tile_region(n_sites, region, density, n_iterations
     assert layout.columns["share"].mean() == pytest.approx(1.0, rel=1e-12)
 
 
-@pytest.mark.slow
 @given(seeds)
 @settings(relaxed, max_examples=examples(5))
 def test_layout_depends_only_on_seed(seed):
     first, repeated, other = (
-        voronoi(n_sites=50, size_um=(9.0, 6.0), density=fovea, seed=s) for s in (seed, seed, seed + 1)
+        voronoi(n_sites=50, size_um=(9.0, 6.0), density=fovea, n_iterations=3, seed=s) for s in (seed, seed, seed + 1)
     )
 
     assert_same(first, repeated)
@@ -654,7 +652,7 @@ def test_function_integrals_are_accurate_to_1e_7(width_um, n_sites):
     st.integers(0, 4),
     seeds,
 )
-@relaxed
+@settings(relaxed, max_examples=examples(20))
 def test_equal_capacity_sites_tile_region(n_sites, region, kind, n_iterations, seed):
     density = {"uniform": {}, "fovea": {"density": fovea}, "picture": picture_options(region)}[kind]
     layout = voronoi(n_sites=n_sites, region=region, n_iterations=n_iterations, capacity="equal", seed=seed, **density)
@@ -746,7 +744,7 @@ def test_mass_derivatives_agree_with_differences(kind, is_own):
     """Finite differences in a star, whose notches divide cells."""
     density, grid = {"uniform": (None, None), "fovea": (fovea, None), "picture": random_picture(STAR)}[kind]
     field = _density(density, grid, STAR)[0]
-    centres, n, step_um2 = points_in(STAR, 25, 10), 25, 1e-5
+    centres, n, step_um2 = points_in(STAR, 15, 10), 15, 1e-5
     cells = IncrementalCells(STAR)
 
     def mass(weights):
@@ -770,7 +768,7 @@ def test_equal_capacity_layout_is_reproducible():
 def test_equal_capacity_of_discontinuous_function_raises():
     with pytest.raises(GeometryError, match=r"found no cells of equal capacity: the smallest .* a picture instead"):
         voronoi(
-            n_sites=20,
+            n_sites=10,
             size_um=(10.0, 10.0),
             density=lambda xy_um: 1.0 + 99.0 * (np.hypot(*xy_um.T) < 3.3),
             capacity="equal",
@@ -934,8 +932,8 @@ shapes = st.sampled_from(["disc", "square"])
 
 
 @pytest.mark.slow
-@given(st.floats(0.1, 50.0), st.floats(3.0, 40.0), shapes)
-@relaxed
+@given(st.floats(0.1, 50.0), st.floats(3.0, 30.0), shapes)
+@settings(relaxed, max_examples=examples(15))
 def test_penrose_rhombs_tile_without_gaps(side_um, size, shape):
     layout = penrose(side_um=side_um, size_um=size * side_um, shape=shape)
     covered = shapely.union_all(layout.polygons())
@@ -1025,18 +1023,20 @@ def test_invalid_penrose_layout_raises(changes, message):
 
 
 @pytest.mark.parametrize(
-    ("layout", "generator"),
+    ("make", "parameters"),
     [
-        (fovi(fov_um=100.0, a_um=10.0, n_rings=3), "fovi"),
-        (sunflower(n_sites=20, spacing_um=1.0), "sunflower"),
-        (voronoi(n_sites=20, size_um=(4.0, 3.0), n_iterations=1), "voronoi"),
-        (quadtree(np.eye(4), pitch_um=1.0, limit=0.5, n_levels=2), "quadtree"),
-        (penrose(side_um=1.0, size_um=8.0), "penrose"),
+        (fovi, {"fov_um": 100.0, "a_um": 10.0, "n_rings": 3}),
+        (sunflower, {"n_sites": 20, "spacing_um": 1.0}),
+        (voronoi, {"n_sites": 20, "size_um": (4.0, 3.0), "n_iterations": 1}),
+        (quadtree, {"importance": np.eye(4), "pitch_um": 1.0, "limit": 0.5, "n_levels": 2}),
+        (penrose, {"side_um": 1.0, "size_um": 8.0}),
     ],
-    ids=lambda value: value if isinstance(value, str) else "",
+    ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_provenance_contains_generator_and_parameters(layout, generator):
-    assert layout.provenance["generator"] == generator
+def test_provenance_contains_generator_and_parameters(make, parameters):
+    layout = make(**parameters)
+
+    assert layout.provenance["generator"] == make.__name__
     assert {"n_sites", "side_um", "fov_um", "pitch_um"} & set(layout.provenance["parameters"])
 
 

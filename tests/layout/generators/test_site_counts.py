@@ -39,10 +39,13 @@ CASES = [
 IDS = [f"{name}-{'-'.join(sorted(set(parameters) - {'importance'}))}" for name, parameters in CASES]
 
 
-@pytest.mark.slow
+@pytest.mark.slow(keep=3)
 @pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")
-@pytest.mark.parametrize("n_sites", [900, 2117])
-@pytest.mark.parametrize(("name", "parameters"), CASES, ids=IDS)
+@pytest.mark.parametrize(
+    ("name", "parameters", "n_sites"),
+    [(*case, (900, 2117)[i % 2]) for i, case in enumerate(CASES)],
+    ids=IDS,
+)
 def test_target_is_reached_or_rejected(name, parameters, n_sites):
     make = LAYOUTS[name]
 
