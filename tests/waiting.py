@@ -9,10 +9,11 @@ from pathlib import Path
 DEADLINE_S = 120.0
 
 
-def wait_until(condition, step_s=0.005):
-    """Return the first true value of a condition; fail after the deadline."""
+def wait_until(condition, *, program=None, step_s=0.005):
+    """Return the first true value of a condition; fail after the deadline, and when the program that brings it about has ended."""
     end_s = time.monotonic() + DEADLINE_S
     while not (found := condition()):
+        assert program is None or program.poll() is None, f"the program ended with {program.returncode}"
         if time.monotonic() > end_s:
             raise AssertionError(f"did not happen within {DEADLINE_S:g} s")
         time.sleep(step_s)

@@ -9,7 +9,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import time
 import zipfile
 from contextlib import closing, suppress
 from pathlib import Path
@@ -19,6 +18,7 @@ import optuna
 import pytest
 import yaml
 from PIL import Image
+from waiting import DEADLINE_S, wait_until
 
 from foveasim import cli, explore
 from foveasim.config import build_shot
@@ -83,13 +83,18 @@ DATA_SET = {
 #: Pictures of two classes, the second before the first in the alphabet.
 NAMES = ("dogs/2.png", "dogs/10.png", "cats/1.png")
 N_Y, N_X = 40, 48
-#: A metric that takes its time, so that a program can be ended amid trials.
+#: A metric that waits when it was called more often than the file ``held`` says, so that a program can be ended amid trials.
 METRICS = """
-import time
+import os, time
 from pathlib import Path
 
 def patient(shot, camera, capture):
-    time.sleep(0.15)
+    held, calls = (Path(__file__).with_name(name) for name in ("held", "calls"))
+    log = os.open(calls, os.O_CREAT | os.O_APPEND | os.O_WRONLY)
+    os.write(log, b"x")
+    os.close(log)
+    while held.exists() and calls.stat().st_size > int(held.read_text()):
+        time.sleep(0.01)
     return float(capture.code.mean())
 
 def harsh(shot, camera, capture):
@@ -203,19 +208,49 @@ def n_begun(path):
 
 
 def ended(end, folder, n_trials):
-    """Send a signal to a study after ``n_trials``: its exit code and standard error."""
+    """Send a signal to a study after ``n_trials``, before all have ended: its exit code and standard error."""
+    calls, held, n_before = folder / "calls", folder / "held", n_begun(folder / "study.db")
+    if end is None:
+        held.unlink()
+    else:
+        held.write_text(str((calls.stat().st_size if calls.exists() else 0) + n_trials - n_before + 2))
     command = [sys.executable, "-m", "foveasim.cli", "study", "slow.yaml", "--metric", "own:patient"]
     running = subprocess.Popen(
         command, cwd=folder, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    limit_s = time.monotonic() + 60.0
-    while n_begun(folder / "study.db") < n_trials and running.poll() is None:
-        assert time.monotonic() < limit_s
-        time.sleep(0.02)
+    wait_until(lambda: n_begun(folder / "study.db") >= n_trials or running.poll() is not None)
     if end is not None:
         os.killpg(running.pid, end)
-    _, said = running.communicate(timeout=60)
+    _, said = running.communicate(timeout=DEADLINE_S)
     return running.returncode, said
+
+
+#: The process that forks workers waits for the file ``go``.
+HELD_FORK_SERVER = """
+import os, sys, time
+if any("multiprocessing.forkserver" in argument for argument in sys.orig_argv):
+    open("starts", "w").close()
+    while not os.path.exists("go"):
+        time.sleep(0.01)
+"""
+#: Shards of a dataset are stored only until there are three, while the file ``held`` exists.
+HELD_SHARDS = """
+import os, time
+from pathlib import Path
+replace = os.replace
+def held(source, target, **options):
+    while str(target).endswith(".tar") and os.path.exists("held") and len(list(Path("dataset").glob("*.tar"))) >= 3:
+        time.sleep(0.01)
+    return replace(source, target, **options)
+os.replace = held
+"""
+
+
+def at_start(folder, script):
+    """Return variables of the environment with which all Python processes first run a script."""
+    (folder / "at_start").mkdir()
+    (folder / "at_start" / "sitecustomize.py").write_text(script)
+    return {"PYTHONPATH": str(folder / "at_start")}
 
 
 def processes_of(group):
@@ -242,28 +277,25 @@ def test_signal_while_workers_start_gives_one_line(folder, command, end):
     running = subprocess.Popen(
         [sys.executable, "-m", "foveasim.cli", command, "own.yaml", "--workers", "2"],
         cwd=folder,
+        env=os.environ | at_start(folder, HELD_FORK_SERVER),
         start_new_session=True,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
-    limit_s = time.monotonic() + 60.0
-    while len(processes_of(running.pid)) < 3 and running.poll() is None:  # the resource tracker and the fork server
-        assert time.monotonic() < limit_s
-        time.sleep(0.01)
+    wait_until((folder / "starts").exists, program=running)
     if end == signal.SIGINT:  # a terminal sends Ctrl-C to all processes
         os.killpg(running.pid, end)
     else:
         running.send_signal(end)
-    _, said = running.communicate(timeout=60)
+    (folder / "go").touch()
+    _, said = running.communicate(timeout=DEADLINE_S)
 
     assert running.returncode == 128 + end
     assert said.startswith("interrupted; finished ")
     assert said.count("\n") == 1
     assert not list(folder.glob("*.db"))
-    while processes_of(running.pid):
-        assert time.monotonic() < limit_s
-        time.sleep(0.05)
+    wait_until(lambda: not processes_of(running.pid))
 
 
 def test_failed_study_leaves_no_file(folder, monkeypatch):
@@ -612,15 +644,19 @@ def test_interrupted_dataset_resumes_identically(folder):
     (folder / "long.yaml").write_text(json.dumps(DATA_SET | {"cameras": 100, "per_shard": 10}))
     command = [sys.executable, "-m", "foveasim.cli", "dataset", "long.yaml", "--workers", "2"]
     shards = lambda: {p.name: p.stat().st_mtime_ns for p in (folder / "dataset").glob("*.tar")}  # noqa: E731
+    (folder / "held").touch()
     running = subprocess.Popen(
-        command, cwd=folder, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command,
+        cwd=folder,
+        env=os.environ | at_start(folder, HELD_SHARDS),
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
-    limit_s = time.monotonic() + 120.0
-    while len(shards()) < 2:
-        assert time.monotonic() < limit_s
-        time.sleep(0.01)
+    wait_until(lambda: len(shards()) >= 2, program=running)
     os.killpg(running.pid, signal.SIGINT)
-    _, wrong = running.communicate(timeout=120)
+    _, wrong = running.communicate(timeout=DEADLINE_S)
     before = shards()
 
     assert running.returncode == 130

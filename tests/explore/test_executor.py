@@ -41,12 +41,19 @@ SHOT = {
 
 
 def logging_function(path):
-    """Return a function of an item that takes 1 to 40 ms and logs its begin and end."""
+    """
+    Return a function of an item that takes 1 to 40 ms and logs its begin and end.
+
+    The second half of the items waits until a worker was killed.
+    """
+    killed, n_first = path.with_name("killed"), N_ITEMS // 2
 
     def compute(item):
         log = os.open(path, os.O_CREAT | os.O_APPEND | os.O_WRONLY)
         os.write(log, f"begin {item} {os.getpid()}\n".encode())
         time.sleep(0.001 + 0.039 * random.Random(item).random())
+        while item >= n_first and not killed.exists():
+            time.sleep(0.01)
         os.write(log, f"done {item} {os.getpid()}\n".encode())
         os.close(log)
         return item**2
@@ -70,6 +77,7 @@ def test_no_item_is_lost_with_workers(seed, tmp_path):
             try:
                 os.kill(rng.choice(sorted(workers)), signal.SIGKILL)
                 n_kills[0] += 1
+                (tmp_path / "killed").touch()
             except (IndexError, ProcessLookupError):
                 pass
 
@@ -205,9 +213,11 @@ def test_local_workers_have_present_environment(monkeypatch):
 
 
 @pytest.mark.slow
-def test_local_workers_have_different_random_states():
+def test_local_workers_have_different_random_states(tmp_path):
     def draw(_):
-        time.sleep(0.05)
+        (tmp_path / str(os.getpid())).touch()
+        while len(list(tmp_path.iterdir())) < 2:
+            time.sleep(0.01)
         return os.getpid(), np.random.get_state()[1].tobytes()  # noqa: NPY002
 
     with executor(draw, what="the function", workers=2) as run:

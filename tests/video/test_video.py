@@ -7,12 +7,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import DEADLINE_S, wait_until
 
 import foveasim as fs
 from foveasim._core.random_streams import Streams
@@ -923,35 +923,29 @@ def test_ctrl_c_preserves_all_frames(tmp_path):
 RECORDER = """
 import sys, time
 from pathlib import Path
-sys.path.insert(0, TESTS)
+sys.path[:0] = TESTS
 from test_video import count_recorded_frames, rolling, write_video
 recording = sys.modules[count_recorded_frames.__module__]
 recording.CHUNK_CODES, recording.WRITE_S = 500, 0.0
 
 def slowly(captures):
     for capture in captures:
-        time.sleep(60.0 if capture.settings["frame"] == 10 else 0.02)
+        if capture.settings["frame"] == 10:
+            time.sleep(600)
         yield capture
 
 write_video(slowly(rolling(count_recorded_frames("v.zarr"))), "v.zarr", resume=True)
 """
 
 
-def wait_for(condition, limit_s=60.0):
-    end_s = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.005)
-
-
 @pytest.mark.slow
 def test_killed_process_leaves_valid_recording(tmp_path, monkeypatch):
     script, path = tmp_path / "record.py", tmp_path / "v.zarr"
-    script.write_text(f"TESTS = {str(Path(__file__).parent)!r}\n{RECORDER}")
+    script.write_text(f"TESTS = {list(map(str, Path(__file__).parents[:2]))!r}\n{RECORDER}")
     n_recorded = 0
     for more in (2, 3):
         running = subprocess.Popen([sys.executable, script], cwd=tmp_path)
-        wait_for(lambda n_expected=n_recorded + more: count_recorded_frames(path) >= n_expected)
+        wait_until(lambda n=n_recorded + more: count_recorded_frames(path) >= n, program=running)
         running.kill()
         assert running.wait() == -signal.SIGKILL
         assert n_recorded + more <= count_recorded_frames(path) < 11
@@ -1355,9 +1349,26 @@ def test_command_stops_after_given_frames(directory):
     assert sorted(p.name for p in (directory / "pictures").iterdir()) == ["frame_000000.png", "frame_000001.png"]
 
 
-def run_command(*arguments, **options):
+#: The command, which waits with a number of recorded frames, and says so.
+HELD_COMMAND = """
+import sys, time
+from pathlib import Path
+from foveasim import cli
+from foveasim.video import recording
+n_frames, add = int(sys.argv.pop(1)), recording._Frames.add
+def held(frames, capture):
+    if capture.settings["frame"] == n_frames:
+        Path("held").touch()
+        time.sleep(600)
+    add(frames, capture)
+recording._Frames.add = held
+cli.main()
+"""
+
+
+def run_command(n_frames, *arguments, **options):
     return subprocess.Popen(
-        [sys.executable, "-m", "foveasim.cli", "video", "shot.yaml", "--frames", "frames", *arguments],
+        [sys.executable, "-c", HELD_COMMAND, str(n_frames), "video", "shot.yaml", "--frames", "frames", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -1370,22 +1381,19 @@ def test_stopped_command_resumes(directory, capsys):
     frames, out = directory / "frames", directory / "v.zarr"
     for k in range(3, 400):
         os.link(frames / f"{k % 3}.png", frames / f"{k}.png")
-    n_recorded = 0
-    for delay_s in (0.1, 0.3, 1.0):  # the first frame may not be recorded yet
-        running = run_command("--out", "v.zarr", cwd=directory)
-        wait_for((partial_path(out) / "frame" / "zarr.json").exists)
-        time.sleep(delay_s)
+    messages = []
+    for n_frames in (0, 20):
+        running = run_command(n_frames, "--out", "v.zarr", cwd=directory)
+        wait_until((directory / "held").exists, program=running)
         running.send_signal(signal.SIGINT)
-        _, message = running.communicate(timeout=60)
+        messages.append(running.communicate(timeout=DEADLINE_S)[1])
         assert running.returncode == 130
-        n_recorded = count_recorded_frames(out)
-        if n_recorded:
-            break
-        assert message == "interrupted\n"
+        assert count_recorded_frames(out) == n_frames
+        (directory / "held").unlink()
 
-    assert message.startswith("interrupted; ")
-    assert f"{n_recorded} frames" in message
-    assert 0 < n_recorded < 400
+    assert messages[0] == "interrupted\n"
+    assert messages[1].startswith("interrupted; ")
+    assert "20 frames" in messages[1]
     assert not out.exists()
 
     arguments = ("shot.yaml", "--frames", "frames", "--out", "v.zarr")
