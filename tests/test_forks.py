@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from waiting import DEADLINE_S
 
 import foveasim as fs
 from foveasim._core.threads import ForkSafeLock, cached_property
@@ -123,7 +124,7 @@ def test_lock_of_forking_thread_stays_held():
 
 
 def test_cached_property_is_computed_without_lock():
-    barrier = threading.Barrier(2, timeout=60.0)
+    barrier = threading.Barrier(2, timeout=DEADLINE_S)
 
     class Item:
         @cached_property

@@ -8,6 +8,7 @@ import time
 import warnings
 
 import pytest
+from waiting import DEADLINE_S
 
 from foveasim._core.threads import in_order, parallel_map
 
@@ -26,7 +27,7 @@ def test_no_items_give_no_results():
 
 
 def test_threads_run_concurrently():
-    barrier = threading.Barrier(2, timeout=60.0)
+    barrier = threading.Barrier(2, timeout=DEADLINE_S)
     parallel_map(lambda _: barrier.wait(), range(2), 2)
 
 
@@ -62,12 +63,12 @@ def _sum_of_squares(n: int) -> int:
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="requires fork")
 def test_forked_process_starts_new_threads():
-    barrier = threading.Barrier(2, timeout=60.0)
+    barrier = threading.Barrier(2, timeout=DEADLINE_S)
     parallel_map(lambda _: barrier.wait(), range(2), 2)  # starts the threads of the parent
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # forking with threads is tested here
         with multiprocessing.get_context("fork").Pool(1) as pool:
-            assert pool.apply_async(_sum_of_squares, (100,)).get(timeout=60.0) == sum(k * k for k in range(100))
+            assert pool.apply_async(_sum_of_squares, (100,)).get(timeout=DEADLINE_S) == sum(k * k for k in range(100))
 
 
 def test_items_are_taken_limited_number_ahead():

@@ -16,6 +16,7 @@ import pytest
 import tifffile
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
+from waiting import DEADLINE_S
 
 from foveasim._io import images
 from foveasim._io.images import read_picture, write_picture
@@ -604,7 +605,7 @@ def test_tiff_with_cyclic_pages_terminates(tmp_path):
         "except FileError: pass\n"
     )
     # In a separate process, with a timeout for an infinite loop.
-    subprocess.run([sys.executable, "-c", program, str(path)], check=True, timeout=20)
+    subprocess.run([sys.executable, "-c", program, str(path)], check=True, timeout=DEADLINE_S)
 
 
 METADATA = PngInfo()

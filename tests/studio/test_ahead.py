@@ -6,6 +6,7 @@ import threading
 
 import numpy as np
 import pytest
+from waiting import DEADLINE_S
 
 import foveasim as fs
 from foveasim.config import build_shot
@@ -51,7 +52,7 @@ def test_result_of_other_values_is_computed(counted, calls):
 
 def test_work_that_has_not_begun_is_cancelled(calls):
     begin = threading.Event()
-    busy = Ahead(lambda layout: begin.wait(30.0))
+    busy = Ahead(lambda layout: begin.wait(DEADLINE_S))
     late = Ahead(lambda layout: calls.append(threading.current_thread() is threading.main_thread()))
     busy.start(ONE)
     late.start(OTHER)  # waits for the thread

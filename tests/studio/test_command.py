@@ -14,6 +14,7 @@ from urllib.request import url2pathname
 
 import pytest
 from typer.testing import CliRunner
+from waiting import DEADLINE_S, wait_until
 
 from foveasim import studio
 from foveasim.cli import app
@@ -24,17 +25,25 @@ from foveasim.studio._files import file_name, start_settings
 from foveasim.studio._server import host_names
 
 
+class Started(list):
+    """The studios that were started; ``is_waiting``: set by a browser that does not return."""
+
+    def __init__(self):
+        super().__init__()
+        self.is_waiting = threading.Event()
+
+
 @pytest.fixture
 def started(monkeypatch):
     """Record the studio instead of serving it."""
-    found = []
+    found = Started()
 
     def record(served, _listener, announce):
         found.append(served)
         announce()
         for thread in threading.enumerate():
             if thread.name == "studio browser":  # its page is deleted with the server
-                thread.join(1.0)
+                wait_until(lambda thread=thread: found.is_waiting.is_set() or not thread.is_alive())
         served.close()
 
     monkeypatch.setattr(_server, "serve", record)
@@ -82,7 +91,7 @@ def test_browser_opens_address(started, monkeypatch):
     result = CliRunner().invoke(app, ["studio", str(demo_settings()[1])])
 
     # A file for this user: the arguments of a command are visible to all.
-    page, mode = opened.get(timeout=60.0)
+    page, mode = opened.get(timeout=DEADLINE_S)
     assert mode == 0o600
     assert f'url={result.output.split()[2]}"' in page
     assert "no browser" not in result.output
@@ -98,7 +107,7 @@ def test_text_browsers_are_not_opened(started, monkeypatch):
 def test_waiting_browser_delays_nothing(started, monkeypatch):
     is_closed = threading.Event()
     browser = Browser("kiosk", queue.Queue())
-    browser.open = lambda _: is_closed.wait(60.0)
+    browser.open = lambda _: (started.is_waiting.set(), is_closed.wait(DEADLINE_S))
     monkeypatch.setattr("webbrowser.get", lambda: browser)
     result = CliRunner().invoke(app, ["studio"])
     is_closed.set()
@@ -186,7 +195,7 @@ def test_printed_address_is_reachable(monkeypatch, host):
 
     def announce(address, _):
         name, _, port = address.removeprefix("http://").partition("/")[0].rpartition(":")
-        with socket.create_connection((name.strip("[]"), int(port)), timeout=10.0):
+        with socket.create_connection((name.strip("[]"), int(port)), timeout=DEADLINE_S):
             connected.append(address)
 
     monkeypatch.setattr(_server, "serve", connect)
