@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import shapely
@@ -16,10 +18,15 @@ from foveasim.errors import CoverageWarning, ParameterError
 BARREL = BrownConrady(focal_um=200.0, k1=-0.12, k2=0.02, p1=0.03, p2=-0.02)
 GRID = fs.Grid.centred((240, 240), 0.5)
 LAYOUTS = {
-    "hexagons": fs.layout.tiling(pitch_um=9.0, radius_um=50.0),
-    "rings": fs.layout.log_polar(n_sectors=16, r_min_um=6.0, r_max_um=44.0, fovea="rings", chords_per_arc=3),
-    "quads": fs.layout.quadtree(np.eye(16), pitch_um=6.0, limit=0.5, n_levels=3),
+    "hexagons": lambda: fs.layout.tiling(pitch_um=9.0, radius_um=50.0),
+    "rings": lambda: fs.layout.log_polar(n_sectors=16, r_min_um=6.0, r_max_um=44.0, fovea="rings", chords_per_arc=3),
+    "quads": lambda: fs.layout.quadtree(np.eye(16), pitch_um=6.0, limit=0.5, n_levels=3),
 }
+
+
+@cache
+def layout_named(name):
+    return LAYOUTS[name]()
 
 
 def field(x_um, y_um):
@@ -54,7 +61,7 @@ def real_irradiance(lens, grid, *, density):
 @pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_distorted_maps_converge_to_undistorted_outlines(name):
-    layout = LAYOUTS[name]
+    layout = layout_named(name)
     fine = fs.Grid.centred((1000, 1000), 0.14)
     undistorted = fs.Integrator(layout, fine, distortion=BARREL)(field_means(fine))
     errors = []
@@ -70,7 +77,7 @@ def test_distorted_maps_converge_to_undistorted_outlines(name):
 
 @pytest.mark.parametrize("name", ["hexagons", "rings", "quads"])
 def test_tiling_power_sums_to_union_power(name):
-    layout = LAYOUTS[name]
+    layout = layout_named(name)
     union = fs.Layout.from_polygons([shapely.coverage_union_all(layout.polygons())])
     cells = field_means(GRID)
     parts = fs.Integrator(layout, GRID, distortion=BARREL)(cells)
@@ -81,7 +88,7 @@ def test_tiling_power_sums_to_union_power(name):
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_conserving_density_preserves_uniform_field(name):
-    layout = LAYOUTS[name]
+    layout = layout_named(name)
     density = fs.Integrator(layout, GRID, distortion=BARREL, conserve="density")(np.full(GRID.shape, 3.0))
     flux = fs.Integrator(layout, GRID, distortion=BARREL)(np.full(GRID.shape, 3.0))
 
@@ -90,7 +97,7 @@ def test_conserving_density_preserves_uniform_field(name):
 
 
 def test_ideal_lens_leaves_integrals_unchanged():
-    for layout in LAYOUTS.values():
+    for layout in map(layout_named, LAYOUTS):
         plain = fs.Integrator(layout, GRID)
         undistorted = fs.Integrator(layout, GRID, distortion=BrownConrady(focal_um=100.0))
         np.testing.assert_allclose(undistorted(field_means(GRID)), plain(field_means(GRID)), rtol=1e-12)
@@ -99,7 +106,7 @@ def test_ideal_lens_leaves_integrals_unchanged():
 
 @pytest.mark.parametrize("conserve", ["flux", "density"])
 def test_operator_adjoint_and_matrix_agree(conserve):
-    layout = LAYOUTS["hexagons"]
+    layout = layout_named("hexagons")
     integrator = fs.Integrator(layout, GRID, distortion=BARREL, conserve=conserve)
     cells = field_means(GRID)
     values = np.linspace(1, 2, layout.n_sites)
@@ -182,7 +189,7 @@ def test_camera_warns_of_sites_outside_image_circle():
 )
 def test_integrator_rejects_invalid_distortion(options, message):
     with pytest.raises(ParameterError, match=message):
-        fs.Integrator(LAYOUTS["hexagons"], GRID, **options)
+        fs.Integrator(layout_named("hexagons"), GRID, **options)
 
 
 @pytest.mark.parametrize("kind", ["grid", "log_polar"])

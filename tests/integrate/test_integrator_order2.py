@@ -12,6 +12,7 @@ import shapely
 from effort import examples
 from hypothesis import given, settings
 from reference.polygons import POLYGONS, polygons
+from reference.tilings import tiling
 
 import foveasim as fs
 from foveasim.distortion import BrownConrady
@@ -26,13 +27,7 @@ LINEAR = (20.0, 1.3, -2.1)
 EXACT = 1e-11
 BARREL = BrownConrady(focal_um=200.0, k1=-0.12, k2=0.02, p1=0.03, p2=-0.02)
 
-TILINGS = {
-    "hexagonal": fs.layout.hexagonal(n_columns=12, n_rows=13, pitch_um=0.9),
-    "grid": fs.layout.grid(n_x=13, n_y=11, pitch_um=0.77),
-    "log_polar": fs.layout.log_polar(n_sectors=24, r_min_um=0.2, r_max_um=4.7, fovea="rings"),
-    "voronoi": fs.layout.voronoi(n_sites=200, size_um=(9.0, 9.0), n_iterations=3).translate(0.1, 0.1),
-    "penrose": fs.layout.penrose(side_um=0.9, size_um=10.0),
-}
+FAMILIES = ("hexagonal", "grid", "log_polar with fovea", "voronoi", "penrose")
 
 
 def second(polygon, grid=GRID, **options):
@@ -120,7 +115,7 @@ def test_linear_fields_are_exact_over_the_zoo(name):
     )
 
 
-@settings(max_examples=examples(1000))
+@settings(max_examples=examples(300))
 @given(polygon=polygons(SHAPE))
 def test_linear_fields_are_exact_over_random_polygons(polygon):
     assert second(polygon)(linear_means())[0] == pytest.approx(linear_integral(polygon), rel=EXACT, abs=0.0)
@@ -134,7 +129,7 @@ def test_random_map_equals_clipping_over_zoo(name):
 
 
 @pytest.mark.slow
-@settings(max_examples=examples(150))
+@settings(max_examples=examples(60))
 @given(polygon=polygons(SHAPE))
 def test_random_map_equals_clipping_over_polygons(polygon):
     expected = second_order_by_clipping(polygon, MAP)
@@ -142,7 +137,7 @@ def test_random_map_equals_clipping_over_polygons(polygon):
         assert second(polygon, compiled=compiled)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=1e-15)
 
 
-@settings(max_examples=examples(200))
+@settings(max_examples=examples(100))
 @given(polygon=polygons((2, 2)))
 def test_two_by_two_map_is_exact(polygon):
     got = second(polygon, fs.Grid((2, 2), 1.0))(linear_means((2, 2)))[0]
@@ -192,20 +187,20 @@ def test_cell_without_weight_can_have_moments(order):
 # -- conservation and symmetry -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", TILINGS)
+@pytest.mark.parametrize("name", FAMILIES)
 def test_tiling_conserves_power_of_map(name):
     grid = fs.Grid((23, 31), 0.1, (-1.5, -1.1))
     cells = np.random.default_rng(3).random(grid.shape)
-    integrator = fs.Integrator(TILINGS[name], grid, order=2)
+    integrator = fs.Integrator(tiling(name), grid, order=2)
 
-    assert fs.Integrator(TILINGS[name], grid)(np.ones(grid.shape)).sum() == pytest.approx(23 * 31 * 0.01, rel=1e-12)
+    assert fs.Integrator(tiling(name), grid)(np.ones(grid.shape)).sum() == pytest.approx(23 * 31 * 0.01, rel=1e-12)
     assert integrator(cells).sum() == pytest.approx(cells.sum() * grid.cell_area_um2, rel=1e-12)
 
 
-@pytest.mark.parametrize("name", TILINGS)
+@pytest.mark.parametrize("name", FAMILIES)
 def test_tiling_moments_sum_to_zero(name):
     grid = fs.Grid((23, 31), 0.1, (-1.5, -1.1))
-    plan = fs.Integrator(TILINGS[name], grid, order=2)._plan
+    plan = fs.Integrator(tiling(name), grid, order=2)._plan
     sums = np.zeros((*grid.shape, 2))
     row = np.repeat(np.arange(grid.shape[0]), np.diff(plan.row_cuts))
     np.add.at(sums, (row, plan.cuts[:, 1]), plan.moments)
@@ -214,25 +209,14 @@ def test_tiling_moments_sum_to_zero(name):
     assert np.abs(sums).max() <= 1e-14
 
 
-@pytest.mark.parametrize("name", [*TILINGS, "zoo"])
+@pytest.mark.parametrize("name", [*FAMILIES, "zoo"])
 def test_overlaps_are_bit_identical_to_first_order(name):
-    layout = fs.Layout.from_polygons(list(POLYGONS.values())) if name == "zoo" else TILINGS[name]
+    layout = fs.Layout.from_polygons(list(POLYGONS.values())) if name == "zoo" else tiling(name)
     one, two = (fs.Integrator(layout, fs.Grid((40, 40), 0.3, (-6.0, -6.0)), order=order)._plan for order in (1, 2))
 
     assert np.array_equal(one.spans, two.spans)
     assert np.array_equal(one.weights, two.weights)
     assert one.cuts.size == one.moments.size == 0
-
-
-@pytest.mark.parametrize("name", ["star", "two holes in a row", "off to the left and right", "U shape"])
-def test_weights_ignore_winding_and_start_vertex(name):
-    polygon = POLYGONS[name]
-    reordered = shapely.Polygon(
-        np.roll(polygon.exterior.coords[:-1], 2, axis=0)[::-1],
-        [np.roll(h.coords[:-1], 1, axis=0) for h in polygon.interiors],
-    )
-
-    assert weights_of(reordered) == pytest.approx(weights_of(polygon), abs=1e-15)
 
 
 @pytest.mark.parametrize("name", ["star", "two holes in a row", "comb with teeth in one row", "ring"])
@@ -245,36 +229,6 @@ def test_integer_cell_shift_shifts_weights(name):
     assert weights_of(far, grid)[9:, 17:] == pytest.approx(weights_of(near, grid)[1:-8, 1:-16], abs=8e-15)
 
 
-@pytest.mark.parametrize("name", ["star", "L shape", "hole", "long sliver along a row", "off to the left and right"])
-def test_quarter_rotation_rotates_weights(name):
-    rotated = shapely.transform(POLYGONS[name], lambda xy: np.stack((7.0 - xy[:, 1], xy[:, 0]), axis=1))
-
-    assert weights_of(rotated, fs.Grid((9, 7), 1.0)) == pytest.approx(
-        np.rot90(weights_of(POLYGONS[name]), -1), abs=1e-14
-    )
-
-
-@pytest.mark.parametrize("name", ["star", "circle", "U shape", "hole"])
-def test_split_site_parts_add_up(name):
-    knife = shapely.Polygon([(-20, -20), (30, -20), (30, 4.1), (-20, 2.3)])
-    lower = shapely.get_parts(shapely.intersection(POLYGONS[name], knife))
-    upper = shapely.get_parts(shapely.difference(POLYGONS[name], knife))
-    parts = fs.Integrator(fs.Layout.from_polygons([*lower, *upper]), GRID, order=2)(MAP)
-
-    assert parts.sum() == pytest.approx(second(POLYGONS[name])(MAP)[0], rel=EXACT)
-
-
-@pytest.mark.parametrize("n_threads", [2, 3, 8])
-def test_results_are_bit_identical_across_threads(n_threads):
-    grid = fs.Grid.centred((700, 900), 0.5)
-    layout = fs.layout.log_polar(n_sectors=120, r_min_um=3.0, r_max_um=160.0)
-    cells = np.random.default_rng(4).random(grid.shape, dtype=np.float32)
-    one, many = (fs.Integrator(layout, grid, order=2, n_threads=n) for n in (1, n_threads))
-
-    assert np.array_equal(many(cells), one(cells))
-    assert np.array_equal(many.spread(np.arange(layout.n_sites)), one.spread(np.arange(layout.n_sites)))
-
-
 # -- operator, adjoint and matrix --------------------------------------------------------------------------------------
 
 
@@ -282,7 +236,7 @@ def test_results_are_bit_identical_across_threads(n_threads):
 @pytest.mark.parametrize("distortion", [None, BARREL])
 @pytest.mark.parametrize("shape", [(70, 90), (300, 280), (1, 90), (70, 1), (2, 3)])
 def test_operator_adjoint_and_matrix_agree(shape, distortion, conserve):
-    layout = TILINGS["log_polar"]
+    layout = tiling("log_polar with fovea")
     grid = fs.Grid.centred(shape, 12.0 / max(shape))
     integrator = fs.Integrator(layout, grid, order=2, distortion=distortion, conserve=conserve)
     rng = np.random.default_rng(1)
@@ -294,30 +248,16 @@ def test_operator_adjoint_and_matrix_agree(shape, distortion, conserve):
     np.testing.assert_allclose(spread, values @ matrix.toarray(), rtol=1e-12, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", POLYGONS)
-def test_matrix_equals_operator_over_zoo(name):
-    integrator = second(POLYGONS[name])
-
-    assert integrator.weights() @ MAP.ravel() == pytest.approx(integrator(MAP), rel=1e-12, abs=1e-15)
-
-
 def test_spread_crosses_band_boundaries(monkeypatch):
     from foveasim.integrate import _plan
 
     grid = fs.Grid((70, 50), 0.2, (-5.0, -7.0))
-    values = np.random.default_rng(1).normal(size=TILINGS["hexagonal"].n_sites)
+    values = np.random.default_rng(1).normal(size=tiling("hexagonal").n_sites)
     monkeypatch.setattr(_plan, "MIN_ROWS_PER_BAND", 1)
     monkeypatch.setattr(_plan, "SMALL_MAP", 0)
-    integrator = fs.Integrator(TILINGS["hexagonal"], grid, order=2)
+    integrator = fs.Integrator(tiling("hexagonal"), grid, order=2)
 
     assert integrator.spread(values).ravel() == pytest.approx(values @ integrator.weights().toarray(), abs=1e-13)
-
-
-def test_float32_map_agrees_with_float64():
-    integrator = fs.Integrator(TILINGS["hexagonal"], fs.Grid((50, 50), 0.25, (-6.0, -6.0)), order=2)
-    cells = np.random.default_rng(2).random((50, 50), dtype=np.float32)
-
-    assert integrator(cells) == pytest.approx(integrator(cells.astype(np.float64)), rel=1e-14, abs=1e-16)
 
 
 # -- cells that are read -----------------------------------------------------------------------------------------------
@@ -346,15 +286,6 @@ def test_nonfinite_cell_reaches_sites_cutting_neighbours_only(bad):
     assert is_bad.sum() == 12
     assert np.array_equal(is_bad, is_adjacent)
     assert power[~is_bad] == pytest.approx(0.36)
-
-
-def test_dark_site_is_precise_near_bright_cells():
-    cells = np.full((8, 400), 1.0)
-    cells[:, :200] = 1e12
-
-    assert second(shapely.box(300.25, 2.25, 380.5, 6.5), fs.Grid((8, 400), 1.0))(cells)[0] == pytest.approx(
-        80.25 * 4.25, rel=1e-14
-    )
 
 
 def test_moment_buffer_grows_for_long_edges():
@@ -419,7 +350,7 @@ def ensquared_energy(cells_per_lambda_n, parts, offset, order):
 
 
 @pytest.mark.parametrize(
-    ("cells_per_lambda_n", "parts", "second_order", "first_order"), [(8.2, 5, 4e-4, 3e-3), (16.2, 5, 3e-5, 8e-4)]
+    ("cells_per_lambda_n", "parts", "second_order", "first_order"), [(8.2, 5, 4e-4, 3e-3), (16.2, 3, 3e-5, 8e-4)]
 )
 def test_ensquared_energy_of_airy_disc_is_accurate(cells_per_lambda_n, parts, second_order, first_order):
     offsets = [(dx, dy) for dx in range(parts) for dy in range(parts)]
@@ -461,4 +392,4 @@ def test_second_order_reduces_error_with_distortion():
 @pytest.mark.parametrize("order", [0, 3, 1.5, "two", None, True])
 def test_integrator_rejects_invalid_order(order):
     with pytest.raises(ParameterError, match="'order' must be"):
-        fs.Integrator(TILINGS["grid"], GRID, order=order)
+        fs.Integrator(tiling("grid"), GRID, order=order)

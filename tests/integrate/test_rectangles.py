@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import foveasim as fs
 from foveasim.errors import ParameterError
+from foveasim.integrate import _rectangles
 from foveasim.integrate._plan import Plan
 from foveasim.integrate._rectangles import LatticePlan, RectanglePlan
 from foveasim.layout.lattice import RectangleLattice
@@ -143,12 +144,11 @@ def test_lattice_adjoint_and_matrix_agree(order):
     np.testing.assert_allclose(integrator.weights() @ cells.ravel(), integrator(cells), rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lattice", "rectangles"])
-def test_threads_do_not_change_rectangles(kind):
-    shape = RectangleLattice(
-        np.sort(np.random.default_rng(6).uniform(0, 300, 600)).reshape(-1, 2), [[0.3, 250.1]] * 300
-    )
+def test_threads_do_not_change_rectangles(kind, monkeypatch):
+    monkeypatch.setattr(_rectangles, "SITES_PER_PIECE", 500)
+    monkeypatch.setattr(_rectangles, "FEW_SITES", 0)
+    shape = RectangleLattice(np.sort(np.random.default_rng(6).uniform(0, 300, 120)).reshape(-1, 2), [[0.3, 250.1]] * 60)
     grid = fs.Grid((256, 300), 1.0)
     cells = np.random.default_rng(7).random(grid.shape, np.float32)
     one, three = (fs.Integrator(layout_of_kind(kind, shape), grid, n_threads=n)(cells) for n in (1, 3))
@@ -189,7 +189,7 @@ def test_clockwise_rectangles_are_rejected():
         fs.Integrator(layout, fs.Grid((4, 4), 1.0))
 
 
-@settings(max_examples=examples(60))
+@settings(max_examples=examples(40))
 @given(
     ends=st.lists(st.tuples(st.floats(-3, 12), st.floats(0.01, 9)), min_size=1, max_size=4),
     pitch=st.floats(0.05, 3),

@@ -77,15 +77,15 @@ def check_against_differences(layout, cells, order, rng, n_checks):
 def test_gradient_agrees_with_difference_quotients(order):
     rng = np.random.default_rng(order)
     n_compared = 0
-    for seed in range(130):
-        n_compared += check_against_differences(random_layout(seed), random_map(seed), order, rng, 22)
+    for seed in range(12):
+        n_compared += check_against_differences(random_layout(seed), random_map(seed), order, rng, 12)
 
-    assert n_compared >= 5000
+    assert n_compared >= 240
 
 
 @pytest.mark.parametrize("order", [1, 2])
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=examples(30))
+@settings(max_examples=examples(15))
 def test_drawn_outlines_agree_with_differences(order, seed):
     check_against_differences(random_layout(seed), random_map(seed % 1000), order, np.random.default_rng(seed), 3)
 
