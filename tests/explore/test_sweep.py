@@ -68,7 +68,8 @@ def logging_metric(directory, pause_s=0.0, journal=None):
     """
     Return a metric that logs the seed and process of every execution to a file.
 
-    While the file ``held`` exists, it waits when there are as many executions, or points in a journal, as that file says.
+    While the file ``held`` exists, it waits when there are as many executions, or lines of a journal, as that file says. The
+    first line of a journal is its head.
     """
     log_path, held = directory / "log", directory / "held"
 
@@ -398,7 +399,7 @@ def test_killed_scheduler_is_reported_with_journal(scheduler, tmp_path):
     """Runs last with this scheduler, which it kills."""
     address, program = scheduler
     store = tmp_path / "r.zarr"
-    (tmp_path / "held").write_text("5")
+    (tmp_path / "held").write_text("6")
 
     def kill():
         wait_until(lambda: len(journal_points(store)) >= 5)
@@ -483,7 +484,7 @@ def mean_dn(shot, camera, capture):
         time.sleep(0.01)
     return float(capture.code.mean())
 
-# While the file "held" exists, points wait when the journal has as many as that file says.
+# While the file "held" exists, points wait when the journal has as many lines as that file says.
 def is_held():
     try:
         return len(Path(JOURNAL).read_text().splitlines()) >= int(Path(LOG).with_name("held").read_text())
@@ -517,7 +518,7 @@ COMMAND = [sys.executable, "-m", "foveasim.cli", "sweep", "sweep.yaml", "--worke
 def interrupt(number, directory, n_points):
     """Start a sweep and send a signal when n points are stored; return exit code, messages, and points in the journal."""
     store = directory / "results.zarr"
-    (directory / "held").write_text(str(n_points))
+    (directory / "held").write_text(str(1 + n_points))
     running = subprocess.Popen(
         COMMAND, cwd=directory, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
