@@ -24,7 +24,8 @@ import numpy as np
 import pytest
 import shapely
 from PIL import Image
-from scipy.stats import truncnorm
+from scipy.special import ndtr
+from waiting import DEADLINE_S
 
 import foveasim as fs
 from foveasim import explore
@@ -108,7 +109,7 @@ def test_samples_do_not_depend_on_order():
 def test_samples_do_not_depend_on_process():
     data = labelled()
     order = np.random.default_rng(1).permutation(len(data)).tolist()
-    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         found = list(pool.map(partial(operator.getitem, data), order))
 
     for k, sample in zip(order, found, strict=True):
@@ -185,18 +186,17 @@ def test_random_settings_are_drawn_independently():
 N_DRAWS = 4000
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("distribution", "cdf"),
     [
         ({"uniform": [2.0, 6.0]}, lambda x: (x - 2.0) / 4.0),
         ({"log_uniform": [1.0, 100.0]}, lambda x: np.log(x) / np.log(100.0)),
-        ({"normal": [1.0, 2.0, 0.0, 4.0]}, lambda x: truncnorm(-0.5, 1.5, loc=1.0, scale=2.0).cdf(x)),
+        ({"normal": [1.0, 2.0, 0.0, 4.0]}, lambda x: (ndtr(0.5 * (x - 1.0)) - ndtr(-0.5)) / (ndtr(1.5) - ndtr(-0.5))),
     ],
 )
 def test_continuous_draws_follow_distribution(distribution, cdf):
     draw = explore.parse_distribution("x", distribution)
-    quantiles = np.sort([cdf(draw.sample(0, k)[0]) for k in range(N_DRAWS)])
+    quantiles = np.sort(cdf(np.array([draw.sample(0, k)[0] for k in range(N_DRAWS)])))
 
     # Kolmogorov-Smirnov statistic: it exceeds 2.3 / sqrt(n) with a probability of 1 / 25,000.
     assert np.abs(quantiles - (np.arange(N_DRAWS) + 0.5) / N_DRAWS).max() < 2.3 / np.sqrt(N_DRAWS)
@@ -297,13 +297,15 @@ def test_stored_settings_are_exact(name, vary, tmp_path):
     is_integer_first = set()
     for seed in (0, 4, 5):
         data = explore.Dataset(pictures(12), SHOT, vary, seed=seed, fields=())
-        stored = explore.write_dataset(data, tmp_path / f"{seed}{name}")
-        for k in range(12):
-            assert_same(stored[k], data[k])
-            for path, number in data[k]["settings"].items():
+        stored, samples = explore.write_dataset(data, tmp_path / f"{seed}{name}"), list(data)
+        assert len(samples) == 12
+        for k, sample in enumerate(samples):
+            assert_same(stored[k], sample)
+            settings = data.settings_of(k)
+            for path, number in sample["settings"].items():
                 section, _, key = path.partition(".")
-                assert number == data.settings_of(k)[section][key]
-                assert type(number) is type(data[0]["settings"][path])
+                assert number == settings[section][key]
+                assert type(number) is type(samples[0]["settings"][path])
         section, _, key = next(iter(vary)).partition(".")
         is_integer_first.add(data.settings_of(0)[section][key] in (2, 3, 4))
     assert is_integer_first == {True, False}
@@ -836,8 +838,7 @@ def corrupt_directory(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["data.zarr", "data"])
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize(("name", "workers"), [("data.zarr", 2), ("data", 1)])
 def test_writing_resumes_after_corrupt_picture(name, workers, tmp_path):
     directory, complete = corrupt_directory(tmp_path)
     target = tmp_path / name
@@ -862,62 +863,52 @@ def test_writing_resumes_after_corrupt_picture(name, workers, tmp_path):
         assert_same(stored[k], data[k])
 
 
+#: Writes datasets with a number of workers, each in a process of its own that ends at the sixth picture.
+ENDED_PROGRAM = """
+import json, os, sys
+import numpy as np
+from foveasim import explore
+class Pictures:
+    def __len__(self):
+        return 8
+    def __getitem__(self, k):
+        if k == 5:
+            os._exit(9)
+        return np.random.default_rng(k).integers(0, 256, (40, 48, 3), np.uint8)
+if __name__ == '__main__':
+    shot = json.loads(sys.argv[2])
+    for path in sys.argv[3:]:
+        if (process := os.fork()) == 0:
+            explore.write_dataset(explore.Dataset(Pictures(), shot), path, per_shard=2, workers=int(sys.argv[1]))
+            os._exit(0)
+        print(path, os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]), flush=True)
+"""
+
+
 @pytest.mark.slow
 def test_crash_leaves_only_complete_shards(tmp_path):
     script = tmp_path / "write.py"
-    script.write_text(
-        "import json, os, sys\n"
-        "import numpy as np\n"
-        "from foveasim import explore\n"
-        "class Pictures:\n"
-        "    def __len__(self):\n"
-        "        return 8\n"
-        "    def __getitem__(self, k):\n"
-        "        if k == 5 and sys.argv[2] == 'end':\n"
-        "            os._exit(9)\n"
-        "        return np.random.default_rng(k).integers(0, 256, (40, 48, 3), np.uint8)\n"
-        "if __name__ == '__main__':\n"
-        "    shot = json.loads(sys.argv[3])\n"
-        "    for path in sys.argv[4:]:\n"
-        "        explore.write_dataset(explore.Dataset(Pictures(), shot), path, per_shard=2, workers=int(sys.argv[1]))\n"
-    )
+    script.write_text(ENDED_PROGRAM)
     both = [str(tmp_path / "data.zarr"), str(tmp_path / "data")]
 
-    def run(workers, mode, *paths):
-        command = [sys.executable, str(script), str(workers), mode, json.dumps(SHOT), *paths]
-        return subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
+    def run(workers, *paths):
+        command = [sys.executable, str(script), str(workers), json.dumps(SHOT), *paths]
+        return subprocess.run(command, check=False, capture_output=True, text=True, timeout=DEADLINE_S)
 
-    for path in both:
-        assert run(1, "end", path).returncode == 9
-    lost = run(2, "end", both[1])
-    finished = run(1, "complete", *both)
+    assert run(1, *both).stdout.splitlines() == [f"{path} 9" for path in both]
+    lost = run(2, both[1])
 
     assert "SimulationError: the process that wrote shard 2 ended in every attempt" in lost.stderr
-    assert finished.returncode == 0, finished.stderr
-    data = explore.Dataset([np.random.default_rng(k).integers(0, 256, (40, 48, 3), np.uint8) for k in range(8)], SHOT)
-    for path in both:
-        stored = explore.open_dataset(path)
+    source = Lazy([np.random.default_rng(k).integers(0, 256, (40, 48, 3), np.uint8) for k in range(8)])
+    data = explore.Dataset(source, SHOT)
+    for path in map(Path, both):
+        shards = [file for file in path.rglob("*") if file.suffix == ".tar" or file.parent.parent.name == "c"]
+        before = {file: file.stat().st_mtime_ns for file in shards}
+        stored = explore.write_dataset(data, path, per_shard=2)
+        assert before
+        assert all(file.stat().st_mtime_ns == written for file, written in before.items())
         for k in range(8):
             assert_same(stored[k], data[k])
-
-
-@pytest.mark.slow
-def test_missing_main_guard_is_reported(tmp_path):
-    script = tmp_path / "write.py"
-    script.write_text(
-        "import json, sys\n"
-        "import numpy as np\n"
-        "from foveasim import explore\n"
-        "data = explore.Dataset(np.zeros((64, 64, 64), np.uint8), json.loads(sys.argv[1]))\n"
-        "explore.write_dataset(data, sys.argv[2], workers=2)\n"
-    )
-    command = [sys.executable, str(script), json.dumps(SHOT), str(tmp_path / "data")]
-
-    result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=240)
-
-    assert result.returncode == 1
-    assert "SimulationError: the workers did not start" in result.stderr
-    assert 'make the call under if __name__ == "__main__":' in result.stderr.splitlines()[-1]
 
 
 @pytest.mark.slow
@@ -1374,7 +1365,7 @@ def test_settings_accept_numpy_scalars():
 
 
 def test_denoising_target_is_mean_of_draws():
-    n_draws = 400
+    n_draws = 200
     data = explore.denoising(pictures(1), SHOT, draws=n_draws)
     samples = list(data)
     codes = np.stack([sample["code"] for sample in samples]).astype(float)
@@ -1387,7 +1378,7 @@ def test_denoising_target_is_mean_of_draws():
     assert len({sample["settings"]["exposure_s"] for sample in samples}) == 1
     assert is_noisy.sum() > 20
     assert (off_dn / np.sqrt(variance_dn2 / n_draws))[is_noisy].max() < 5.0
-    assert off_dn[~is_noisy].max(initial=0.0) < 0.05
+    assert off_dn[~is_noisy].max(initial=0.0) < 5.0 * np.sqrt(0.02 / n_draws)
 
 
 def test_classification_draws_cameras_around_shot():
