@@ -8,19 +8,23 @@ OUT ?= out
 INSTALL := -m pip install --quiet --no-compile
 # Arguments for pytest in all test targets.
 PYTEST_ARGS ?=
+# Bytecode is stored next to the sources, even where the environment disables it: each process would compile the package and its tests.
+unexport PYTHONDONTWRITEBYTECODE
 PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 
 # Lower bounds of pyproject.toml on the oldest Python: .venv-lowest/uv resolves them, .venv-lowest/env contains them.
 LOWEST := .venv-lowest
 LOWEST_PYTHON ?= 3.11
 UV := $(LOWEST)/uv/bin/uv
+# Effort of the tests in the other environments: all, or default without the slow ones.
+EFFORT ?= all
 # PyTorch has a separate environment, since its wheel may install gigabytes of CUDA libraries.
 TORCH_VENV ?= .venv-torch
 CHECK_PYTHON = command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found; specify one with: make PYTHON=..."; exit 1; }; \
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	{ echo "foveasim requires Python 3.11 or later; specify one with: make PYTHON=python3.12"; exit 1; }
 
-.PHONY: demo test test-all test-core test-lowest test-torch soak lint lint-js bench bench-torch peers docs clean
+.PHONY: demo test test-all test-nightly test-pages test-core test-lowest test-torch soak lint lint-js bench bench-torch peers docs clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.installed
@@ -39,20 +43,28 @@ test-core:
 		cp tests/installation/calls.py "$$directory" && cd "$$directory" && MPLBACKEND=agg env -u PYTHONPATH \
 		env/bin/python calls.py --program env/bin/foveasim
 
-# The slow tests, too, and all pairs of features in tests/compositions instead of a sample.
+# The slow tests, too, those in a browser, and all pairs of features and invariants in tests/compositions instead of a sample.
 test-all: $(VENV)/.installed-dev
-	FOVEASIM_TESTS_ALL=1 $(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
+	FOVEASIM_TESTS=all $(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
+
+# All tests, with all invariants for all pairs of features.
+test-nightly: $(VENV)/.installed-dev
+	FOVEASIM_TESTS=nightly $(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
+
+# All tests in a browser.
+test-pages: $(VENV)/.installed-dev
+	FOVEASIM_TESTS=all FOVEASIM_TESTS_NEED=chromium $(BIN)/python -m pytest $(PARALLEL) -m pages $(PYTEST_ARGS)
 
 # Deprecation warnings between old versions of dependencies are ignored.
 test-lowest: $(LOWEST)/.installed
-	FOVEASIM_TESTS_ALL=1 NUMBA_CACHE_DIR="$(CURDIR)/$(LOWEST)/numba" $(LOWEST)/env/bin/python -m pytest $(PARALLEL) \
+	FOVEASIM_TESTS=$(EFFORT) NUMBA_CACHE_DIR="$(CURDIR)/$(LOWEST)/numba" $(LOWEST)/env/bin/python -m pytest $(PARALLEL) \
 		-W default::DeprecationWarning -W default::PendingDeprecationWarning -W error::pytest.PytestWarning $(PYTEST_ARGS)
 
 test-torch: $(TORCH_VENV)/.installed
-	FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) foveasim/learn tests/learn tests/integrate/test_vertex_gradient.py \
-		tests/explore/test_dataset_torch.py $(PYTEST_ARGS)
-	FOVEASIM_TESTS_NEED=torch,deepinv,torchvision $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) tests/test_docs.py tests/test_gallery.py \
-		tests/test_notebooks.py tests/installation -k "torch or learn or adapters" $(PYTEST_ARGS)
+	FOVEASIM_TESTS=$(EFFORT) FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) tests/learn \
+		tests/integrate/test_vertex_gradient.py tests/explore/test_dataset_torch.py $(PYTEST_ARGS)
+	FOVEASIM_TESTS=$(EFFORT) FOVEASIM_TESTS_NEED=torch,deepinv,torchvision $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) tests/test_docs.py \
+		tests/test_doctests.py tests/test_gallery.py tests/test_notebooks.py tests/installation -k "torch or learn or adapters" $(PYTEST_ARGS)
 
 # Kills workers at random for some minutes: every item must be computed, at most twice.
 soak: $(VENV)/.installed-dev

@@ -3,7 +3,7 @@ Selection of tests, their requirements, kernels, and distribution to processes.
 
 The default run leaves out tests marked ``slow`` and tests in a browser, except for those that ``slow(keep=...)`` selects: a
 number of parameter sets of each function, spread evenly, or parts of their names; its random tests have a third of the
-examples. Runs of named files and directories, and those with FOVEASIM_TESTS_ALL=1, contain all tests. ``needs("renderer")``,
+examples. Runs of named files and directories, and those with FOVEASIM_TESTS=all, contain all tests. ``needs("renderer")``,
 ``"chromium"``, ``"torch"`` and other modules mark requirements.
 """
 
@@ -14,13 +14,13 @@ import shutil
 import signal
 import sys
 from collections import defaultdict
-from functools import partial
+from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import hypothesis
 import pytest
-from effort import examples
+from effort import effort, examples
 
 from foveasim import compile_kernels
 
@@ -33,6 +33,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@cache
 def renderer_is_missing():
     from foveasim.view import find_renderer
 
@@ -55,6 +56,8 @@ MISSING = {
 }
 
 
+collect_ignore_glob = [] if find_spec("torch") else ["learn/*"]
+
 #: Files with slow tests that share no fixture: each of their tests may run in any process, after all other files, so that the
 #: processes finish at about the same time.
 INDEPENDENT = {
@@ -70,7 +73,7 @@ def pytest_configure(config):
     """Select all tests of named files; compile all kernels once, before several processes would each compile them."""
     is_worker = hasattr(config, "workerinput")
     if not is_worker and config.args_source is config.ArgsSource.ARGS:
-        os.environ.setdefault("FOVEASIM_TESTS_ALL", "1")
+        os.environ.setdefault("FOVEASIM_TESTS", "all")
     # New examples in each run on a developer's machine, the same ones in continuous integration.
     hypothesis.settings.register_profile(
         "foveasim", deadline=None, max_examples=examples(100), derandomize="CI" in os.environ
@@ -80,15 +83,23 @@ def pytest_configure(config):
         compile_kernels()
 
 
+def needs(item):
+    """Return the requirements of a test."""
+    return [what for marker in item.iter_markers("needs") for what in marker.args]
+
+
 def slow_marker(item):
     """Return the marker of a slow test, else None."""
-    needs = [what for marker in item.iter_markers("needs") for what in marker.args]
-    return item.get_closest_marker("slow") or (pytest.mark.slow if "chromium" in needs else None)
+    return item.get_closest_marker("slow") or (pytest.mark.slow if item.get_closest_marker("pages") else None)
 
 
+@pytest.hookimpl(tryfirst=True)  # before the selection by markers of the command line
 def pytest_collection_modifyitems(config, items):
-    """Leave out slow tests, except for those that their markers keep."""
-    if os.environ.get("FOVEASIM_TESTS_ALL") == "1":
+    """Mark tests in a browser; leave out slow tests, except for those that their markers keep."""
+    for item in items:
+        if "chromium" in needs(item):
+            item.add_marker("pages")
+    if effort() != "default":
         return
     of_function = defaultdict(list)
     for item in items:
@@ -121,10 +132,9 @@ def pytest_xdist_make_scheduler(config, log):
 
 def pytest_runtest_setup(item):
     """Skip tests that this machine cannot run, or fail when FOVEASIM_TESTS_NEED contains the requirement."""
-    for marker in item.iter_markers("needs"):
-        for what in marker.args:
-            missing = MISSING[what]()
-            if missing and what in os.environ.get("FOVEASIM_TESTS_NEED", "").split(","):
-                pytest.fail(missing)
-            elif missing:
-                pytest.skip(missing)
+    for what in needs(item):
+        missing = MISSING[what]()
+        if missing and what in os.environ.get("FOVEASIM_TESTS_NEED", "").split(","):
+            pytest.fail(missing)
+        elif missing:
+            pytest.skip(missing)

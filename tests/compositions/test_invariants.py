@@ -1,8 +1,8 @@
 """
 Invariants of captures over combinations of features.
 
-Each row of a table contains one feature of every axis of ``reference.features``. The complete run (``make test-all``) contains
-every pair of features, the default run a sample of rows in which each feature occurs, some of them for each invariant.
+Each row of a table (``reference.covering``) contains one feature of every axis of ``reference.features``, and an invariant. The
+complete run contains every pair of them, the default run the first rows, and the nightly run all rows with all invariants.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ import cloudpickle
 import numpy as np
 import pytest
 import yaml
-from reference.features import axes, axes_names, is_possible, pairwise_rows, sample_rows, settings_of, settings_with
+from effort import effort
+from reference.covering import N_DEFAULT, cases, invariants, pairs_of, possible_pairs, read_rows
+from reference.features import axes, is_possible, settings_of, settings_with
 
 import foveasim as fs
 from foveasim import tiles
@@ -27,24 +29,24 @@ from foveasim.distortion import BrownConrady
 from foveasim.errors import FoveasimWarning
 from foveasim.explore import Dataset
 
-IS_COMPLETE = os.environ.get("FOVEASIM_TESTS_ALL") == "1"
-ROWS = pairwise_rows() if IS_COMPLETE else sample_rows(22)
+ROWS = read_rows()
+CASES = cases(ROWS, effort=effort(), commit=os.environ.get("FOVEASIM_TESTS_COMMIT", ""))
 #: Rounding of integrals: sums over rows of a map in another order.
 ROUNDING = 1e-9
 N_FRAMES = 200
 #: Standard errors of a sample that a statistical test admits.
 N_SIGMA = 5.0
 
-pytestmark = [pytest.mark.filterwarnings("ignore::foveasim.errors.FoveasimWarning"), pytest.mark.slow(keep=6)]
+pytestmark = pytest.mark.filterwarnings("ignore::foveasim.errors.FoveasimWarning")
 
 
 def name_of(row):
     return "-".join(name.replace(" ", "_") for name in row)
 
 
-@pytest.fixture(params=ROWS, ids=name_of)
-def row(request):
-    return request.param
+def pytest_generate_tests(metafunc):
+    if "row" in metafunc.fixturenames:
+        metafunc.parametrize("row", CASES[metafunc.function.__name__.removeprefix("test_")], ids=name_of)
 
 
 @pytest.fixture
@@ -142,6 +144,7 @@ def test_tiles_equal_captures(shot):
     assert np.mean(tile.code != expected.code) < 0.01
 
 
+@pytest.mark.slow(keep=6)
 @pytest.mark.parametrize(
     ("axis", "feature"),
     [(axis, name) for axis in ("photo", "dark", "shot", "temporal", "fixed", "adc") for name in axes()[axis]],
@@ -375,8 +378,26 @@ def test_prediction_equals_moments_of_captures(shot):
 # -- the table ---------------------------------------------------------------------------------------------------------
 
 
-def test_every_feature_occurs():
-    rows = sample_rows(50)
-    assert all(is_possible(row) for row in rows)
-    for k, (axis, features) in enumerate(zip(axes_names(), map(set, zip(*pairwise_rows(), strict=True)), strict=True)):
-        assert {row[k] for row in rows} == features, axis
+def test_table_contains_every_pair():
+    values = [*map(list, axes().values()), invariants()]
+    found = set().union(*map(pairs_of, ROWS))
+    compute = "run: python tests/reference/covering.py"
+
+    assert [row for row in ROWS if not is_possible(row)] == [], compute
+    assert set(possible_pairs(values, is_possible)) - found == set(), compute
+    assert [set(column) for column in zip(*ROWS, strict=True)] == list(map(set, values)), compute
+
+
+def test_default_rows_contain_every_value():
+    for column, values in zip(zip(*ROWS[:N_DEFAULT], strict=True), [*axes().values(), invariants()], strict=True):
+        assert min(map(column.count, values)) >= min(6, N_DEFAULT // len(values)) // 2
+
+
+def test_nightly_cases_contain_every_triple():
+    n_cases = {name: len(rows) for name, rows in cases(ROWS, effort="nightly").items()}
+    parts = [cases(ROWS, effort="all", commit=commit) for commit in ("f0", "f1", "f2")]
+
+    assert set(n_cases.values()) == {len(ROWS)}
+    own = cases(ROWS, effort="all")
+    for name in n_cases:
+        assert sum(len(part[name]) - len(own[name]) for part in parts) == len(ROWS) - len(own[name])
