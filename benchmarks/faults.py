@@ -47,8 +47,11 @@ from rich.table import Table
 
 PLAN = Path(__file__).with_name("faults.jsonl")
 N_FAULTS, SEED = 150, 2024
-#: Values of FOVEASIM_TESTS_ALL.
-SETS = {"default": "0", "complete": "1"}
+#: Environments of the sets of tests; the tests of older commits read FOVEASIM_TESTS_ALL.
+SETS = {
+    "default": {"FOVEASIM_TESTS": "default", "FOVEASIM_TESTS_ALL": "0"},
+    "complete": {"FOVEASIM_TESTS": "all", "FOVEASIM_TESTS_ALL": "1"},
+}
 #: Files whose tests do more in the complete set.
 VARYING = re.compile(r"\b(effort|hypothesis|FOVEASIM_TESTS_ALL)\b")
 #: Largest number and duration, with probes, of the tests of each batch; the last one contains all others.
@@ -96,8 +99,8 @@ def environment(tree: Path, of_set: str, kernels: Path | None = None) -> dict[st
     """Return the environment of tests, with the same random examples in each run, and a directory for compiled kernels."""
     kept = {name: value for name, value in os.environ.items() if name not in {"PYTHONPATH", "PYTHONDONTWRITEBYTECODE"}}
     return kept | {
+        **SETS[of_set],
         "CI": "1",
-        "FOVEASIM_TESTS_ALL": SETS[of_set],
         "NUMBA_CACHE_DIR": str(kernels or tree / ".venv/numba"),
         "PATH": os.pathsep.join([str(tree / ".venv/bin"), str(Path(sys.executable).parent), os.environ["PATH"]]),
     }

@@ -7,7 +7,7 @@ import platform
 import time
 from pathlib import Path
 
-N_ADDITIONS = 10_000_000
+LOOP = compile("total = 0\nfor k in range(10_000_000):\n    total += k\n", "loop", "exec")
 #: Columns of the first line of /proc/stat in which a core does not idle: all but idle and iowait; guests are part of user.
 BUSY_COLUMNS = (0, 1, 2, 5, 6, 7)
 
@@ -23,12 +23,11 @@ def processor_model() -> str:
 
 
 def additions_s() -> float:
-    """Return the processor time of ten million additions in a loop of Python, the shortest of three."""
+    """Return the processor time of ten million additions in a loop of a Python script, the shortest of three."""
     seconds = []
     for _ in range(3):
-        start_s, total = time.process_time(), 0
-        for k in range(N_ADDITIONS):
-            total += k
+        start_s = time.process_time()
+        exec(LOOP, {})  # global names, as in a script: local ones of a function are twice as fast
         seconds.append(time.process_time() - start_s)
     return min(seconds)
 
