@@ -17,7 +17,7 @@ from shapely.affinity import rotate
 import foveasim as fs
 from foveasim.layout.drc.rules import RULES
 
-relaxed = settings(max_examples=examples(60))
+relaxed = settings(max_examples=examples(30))
 
 #: Steps, and the tolerances of deviations from them (degrees, µm).
 STEPS = {
@@ -94,7 +94,7 @@ def test_every_rule_has_reference_implementation():
     assert set(REFERENCES) | FIELD_RULES == set(RULES)
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("rule", sorted(set(REFERENCES) - {"max_gap_um2"}))
 @given(layout=layouts(), fraction=fractions, has_field=st.booleans())
 @relaxed

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import io
 import json
-import struct
 import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
 import zipfile
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -143,7 +141,7 @@ def test_empty_layout_round_trips(tmp_path, extension):
 def test_format_is_detected_by_content(zoo, tmp_path, extension):
     write_layout(zoo, tmp_path / f"a.{extension}")
     expected = read_layout(tmp_path / f"a.{extension}")
-    for wrong in ("yaml", "gds", "npz", "geojson"):
+    for wrong in {"gds": ("yaml", "npz"), "oas": ("gds", "geojson")}.get(extension, ("yaml", "gds", "npz", "geojson")):
         (tmp_path / f"wrong.{wrong}").write_bytes((tmp_path / f"a.{extension}").read_bytes())
         assert_same(read_layout(tmp_path / f"wrong.{wrong}"), expected)
 
@@ -289,16 +287,20 @@ def test_dropped_columns_are_reported(tmp_path, extension):
     assert write_layout(layout[:0], tmp_path / f"a.{extension}").dropped_columns == tuple(sorted(layout.columns))
 
 
-@pytest.mark.slow(keep=8)
+UNUSUAL_NAMES = ("a b", "a=b", 'say "a"', "µ", "", "1", '"a"', "%s", "a\n", "photosite")
+
+
 @pytest.mark.parametrize("extension", GDSII_OASIS)
-@pytest.mark.parametrize("name", ["a b", "a=b", 'say "a"', "µ", "", "1", '"a"', "%s", "a\n", "photosite"])
-def test_unusual_column_names_round_trip(tmp_path, extension, name):
-    layout = hexagonal(pitch_um=3.3, n_columns=2, n_rows=2).with_columns(**{name: np.arange(4), "b": np.arange(4) + 5})
+@pytest.mark.parametrize("names", [UNUSUAL_NAMES[:3], UNUSUAL_NAMES[3:6], UNUSUAL_NAMES[6:]], ids=repr)
+def test_unusual_column_names_round_trip(tmp_path, extension, names):
+    unusual = {name: np.arange(4) + k for k, name in enumerate(names)}
+    layout = hexagonal(pitch_um=3.3, n_columns=2, n_rows=2).with_columns(**unusual, b=np.arange(4) + 5)
     report = write_layout(layout, tmp_path / f"a.{extension}")
     columns = read_layout(tmp_path / f"a.{extension}").columns
 
     assert report.dropped_columns == ()
-    assert columns[name].tolist() == [0, 1, 2, 3]
+    for name, values in unusual.items():
+        assert columns[name].tolist() == values.tolist()
     assert columns["b"].tolist() == [5, 6, 7, 8]
 
 
@@ -637,8 +639,9 @@ def test_svg_rejects_invalid_colours(zoo, tmp_path, colour):
 # -- rounding ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("extension", GDSII_OASIS)
-@pytest.mark.parametrize("dbu_um", [1e-4, 1e-3, 5e-3, 0.0137])
+@pytest.mark.parametrize(
+    ("extension", "dbu_um"), [("gds", 1e-4), ("oas", 1e-3), ("gds", 5e-3), ("oas", 0.0137), ("gds", 0.0137)]
+)
 @pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # 5 and 13.7 nm
 def test_rounding_report_matches_read_layout(tmp_path, extension, dbu_um):
     layout = hexagonal(pitch_um=3.3, n_columns=20, n_rows=20).rotate(17.3)
@@ -667,8 +670,7 @@ def test_large_coordinates_require_larger_unit(tmp_path):
 
 
 @pytest.mark.slow(keep=2)
-@pytest.mark.parametrize("extension", GDSII_OASIS)
-@pytest.mark.parametrize("n", [8190, 8191, 12_000])
+@pytest.mark.parametrize(("extension", "n"), [("gds", 8190), ("gds", 8191), ("gds", 12_000), ("oas", 8191)])
 def test_site_with_many_vertices_round_trips(tmp_path, extension, n):
     star = ring(n, 400.0) * (1.0 + 0.3 * np.sin(40.0 * np.pi * np.arange(n) / n))[:, np.newaxis]
     layout = Layout.from_polygons([shapely.box(600, 0, 601, 1), shapely.Polygon(star)], channel=[3, 1])
@@ -804,7 +806,7 @@ def test_corrupt_files_read_or_raise_within_seconds(small, tmp_path, extension):
     write_layout(small, tmp_path / f"a.{extension}")
     data = (tmp_path / f"a.{extension}").read_bytes()
     rng = np.random.default_rng(11)
-    n = 300 if extension in EXACT else 200
+    n = 120 if extension in EXACT else 60
     paths = []
     for i, corrupt in enumerate(corrupted(data, rng, n)):
         paths.append(tmp_path / f"{i}.{extension}")
@@ -815,25 +817,6 @@ def test_corrupt_files_read_or_raise_within_seconds(small, tmp_path, extension):
 
     assert sum(isinstance(r, str) for r in results) > n // 4
     assert time.perf_counter() - began_s < 120
-
-
-@pytest.mark.slow
-def test_corrupt_oasis_with_valid_checksum_terminates(small, tmp_path):
-    write_layout(small, tmp_path / "a.oas")
-    data = (tmp_path / "a.oas").read_bytes()
-    rng = np.random.default_rng(12)
-    paths = []
-    for i in range(40):
-        corrupt = bytearray(data[:-4])
-        for at in rng.integers(13, len(corrupt) - 256, 1 + i % 3):
-            corrupt[at] ^= 1 << rng.integers(8)
-        paths.append(tmp_path / f"{i}.oas")
-        paths[-1].write_bytes(bytes(corrupt) + struct.pack("<I", zlib.crc32(bytes(corrupt))))
-    with ThreadPoolExecutor(2) as pool:
-        results = list(pool.map(outcome, paths))
-
-    assert len(results) == 40
-    assert not [r for r in results if "took more than" in str(r)]
 
 
 @pytest.mark.parametrize(
@@ -1102,8 +1085,12 @@ DEVICES = {
 
 
 @pytest.mark.slow(keep=10)
-@pytest.mark.parametrize("extension", EXACT + GDSII_OASIS)
-@pytest.mark.parametrize("name", DEVICES)
+@pytest.mark.parametrize(
+    ("name", "extension"),
+    [(name, extension) for name in DEVICES for extension in EXACT]
+    + [(name, GDSII_OASIS[i % 2]) for i, name in enumerate(DEVICES)]
+    + [("log-polar", "oas"), ("rings", "oas")],
+)
 def test_layout_read_again_is_same_device(tmp_path, name, extension):
     layout = DEVICES[name]()
     write_layout(layout, tmp_path / f"a.{extension}")

@@ -832,7 +832,7 @@ def numbered(directory, files, extension):
 @pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("extension", FORMATS)
 def test_truncated_files_and_noise_are_rejected(valid_files, tmp_path, extension):
-    files = truncated(valid_files[extension], 30) + noise(np.random.default_rng(21), 20, extension)
+    files = truncated(valid_files[extension], 14) + noise(np.random.default_rng(21), 10, extension)
 
     for answer in read_in_process(numbered(tmp_path, files, extension)):
         assert_harmless(answer, ERRORS)
@@ -841,7 +841,7 @@ def test_truncated_files_and_noise_are_rejected(valid_files, tmp_path, extension
 @pytest.mark.slow
 @pytest.mark.parametrize("extension", FORMATS)
 def test_flipped_bits_raise_or_give_layout(valid_files, tmp_path, extension):
-    files = flipped(valid_files[extension], np.random.default_rng(22), 30, extension)
+    files = flipped(valid_files[extension], np.random.default_rng(22), 15, extension)
 
     for answer in read_in_process(numbered(tmp_path, files, extension)):
         assert_harmless(answer, ERRORS | {"Layout"})
@@ -851,7 +851,7 @@ def test_flipped_bits_raise_or_give_layout(valid_files, tmp_path, extension):
 @pytest.mark.parametrize("extension", ["npz", "parquet"])
 def test_flipped_directory_bits_raise_or_give_layout(valid_files, tmp_path, extension):
     data = valid_files[extension]
-    files = flipped(data, np.random.default_rng(23), 150, extension, first=max(0, len(data) - 3000))
+    files = flipped(data, np.random.default_rng(23), 60, extension, first=max(0, len(data) - 3000))
 
     for answer in read_in_process(numbered(tmp_path, files, extension)):
         assert_harmless(answer, ERRORS | {"Layout"})
