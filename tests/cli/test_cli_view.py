@@ -11,13 +11,13 @@ import socket
 import struct
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import DEADLINE_S, wait_until
 
 import foveasim as fs
 from foveasim import cli
@@ -159,7 +159,7 @@ def test_page_is_served_on_localhost(view, folder):
             assert "'port' must be a free port" in complaint
         finally:
             server.send_signal(signal.SIGINT)
-            rest, errors = server.communicate(timeout=20)
+            rest, errors = server.communicate(timeout=DEADLINE_S)
 
     assert server.returncode == 0
     assert (rest, errors) == ("", "")
@@ -198,7 +198,7 @@ def serve():
     """Start servers in separate processes; each exits with 0 on Ctrl-C and prints nothing."""
     servers = []
 
-    def start(patience_s=60.0):
+    def start(patience_s=DEADLINE_S):
         code = SERVER.format(patience_s=patience_s)
         server = subprocess.Popen(
             [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -211,14 +211,14 @@ def serve():
     for server in servers:
         server.send_signal(signal.SIGINT)
         try:
-            endings.append((*server.communicate(timeout=30), server.returncode))
+            endings.append((*server.communicate(timeout=DEADLINE_S), server.returncode))
         finally:
             server.kill()
     assert endings == [("", "", 0)] * len(servers)
 
 
 def connect(port, text="", host="127.0.0.1"):
-    connection = socket.create_connection((host, port), timeout=30)
+    connection = socket.create_connection((host, port), timeout=DEADLINE_S)
     connection.sendall(text.encode())
     return connection
 
@@ -272,14 +272,6 @@ def n_connections(port):
     return sum(line.split()[1] == f"0100007F:{port:04X}" and line.split()[3] == "01" for line in lines)
 
 
-def wait_until(condition):
-    for _ in range(600):
-        if condition():
-            return
-        time.sleep(0.05)
-    pytest.fail("waited in vain")
-
-
 @on_linux
 def test_idle_connections_leave_the_page_served(serve):
     port, server = serve()
@@ -330,4 +322,4 @@ def test_ctrl_c_ends_busy_server(serve):
     with connect(port), connect(port, f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n") as reading:
         reading.recv(10)
         server.send_signal(signal.SIGINT)
-        assert server.wait(timeout=30) == 0
+        assert server.wait(timeout=DEADLINE_S) == 0

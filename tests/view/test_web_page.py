@@ -20,6 +20,7 @@ import shapely
 import shapely.affinity
 from matplotlib import colormaps
 from reference.ray_casting import first_hits, rays_of
+from waiting import wait_until
 
 import foveasim as fs
 from foveasim._core.provenance import to_plain_data
@@ -265,16 +266,29 @@ def visit(browser, tmp_path):
 
 def until(page, condition, argument=None):
     """Poll a condition from outside, because the page's content security policy forbids evaluation of strings."""
-    for _ in range(300):
-        if page.evaluate(condition, argument):
-            return
-        page.evaluate("() => new Promise((done) => setTimeout(done, 20))")
-    pytest.fail(f"{condition} did not come true")
+    wait_until(lambda: page.evaluate(condition, argument), step_s=0.02)
+
+
+def settle(page):
+    """Wait until all is drawn, after a frame of the browser, at whose end the page receives new sizes."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    until(page, "foveasim.isIdle")
+
+
+def wheel(page, *steps):
+    """Turn the wheel, and wait until each step has reached the page."""
+    for step in steps:
+        before = page.evaluate("""() => {
+          if (window.turned === undefined) { window.turned = 0; addEventListener("wheel", ({ deltaY }) => { turned += deltaY; }, true); }
+          return turned; }""")
+        page.mouse.wheel(0, step)
+        until(page, "wanted => Math.abs(turned - wanted) < 0.5", before + step)
+    settle(page)
 
 
 def hover(page, x_um, y_um):
     page.mouse.move(*page.evaluate("([x, y]) => foveasim.toWindow(x, y)", [x_um, y_um]))
-    page.evaluate("() => new Promise(requestAnimationFrame)")
+    settle(page)
 
 
 def row(page, label):
@@ -341,10 +355,7 @@ def test_wheel_zooms_about_cursor(visit):
     page.mouse.move(320, 510)
     under = page.evaluate("foveasim.fromWindow(320, 510)")
     before = page.evaluate("foveasim.view.scale")
-    for step in (-200, -200, -200, 150, -200):
-        page.mouse.wheel(0, step)
-    page.evaluate("() => new Promise((done) => setTimeout(done, 50))")
-    until(page, "before => foveasim.view.scale > 3 * before", before)
+    wheel(page, -200, -200, -200, 150, -200)
 
     assert page.evaluate("foveasim.view.scale") / before == pytest.approx(np.exp(0.4 * 4 - 0.3), rel=1e-9)
     assert page.evaluate("foveasim.fromWindow(320, 510)") == pytest.approx(under, abs=1e-9)
@@ -647,7 +658,10 @@ def test_untrusted_names_are_escaped(visit, tmp_path):
         page.locator("#violations button").first.click()
         page.select_option("#colouring", MALICIOUS[0])
         until(page, "name => foveasim.column === name", MALICIOUS[0])
-        page.evaluate("() => new Promise((done) => setTimeout(done, 50))")
+        # Scripts of pictures that cannot be shown would run before that of a later one.
+        page.evaluate(
+            "() => new Promise((done) => { const last = new Image(); last.onerror = done; last.src = 'data:,'; })"
+        )
 
         assert page.evaluate("window.hacked") is None
         assert page.evaluate("document.querySelector('h1').textContent") == name
@@ -862,13 +876,13 @@ def test_keys_rotate_and_hover_highlights_site(visit, tmp_path):
     page.focus("#solid")
     for key in ("ArrowLeft", "ArrowUp", "+", "t", "0"):
         page.keyboard.press(key)
-        page.evaluate("() => new Promise(requestAnimationFrame)")
+        settle(page)
         shots.append(page.screenshot())
     assert all(one != other for one, other in itertools.pairwise(shots))
     x, y = page.evaluate("(p) => foveasim.toWindow(...p)", [*MOSAIC.centroid_um[60], 1.0])
     page.mouse.move(x, y)
     until(page, "foveasim.hovered >= 0")
-    page.evaluate("() => new Promise(requestAnimationFrame)")
+    settle(page)
     (tmp_path / "lit.png").write_bytes(page.screenshot(clip={"x": x - 4, "y": y - 4, "width": 8, "height": 8}))
     red, green, blue = read_picture(tmp_path / "lit.png")[..., :3].reshape(-1, 3).mean(axis=0)
     assert red > green > 1.3 * blue  # the yellow highlight over any filter colour
@@ -1048,11 +1062,6 @@ def stack_prisms():
     )
 
 
-def rest(page):
-    """Wait until drawing has finished."""
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(done))))")  # fmt: skip
-
-
 def press(page, *keys):
     page.focus("#solid")
     for key in keys:
@@ -1142,9 +1151,9 @@ def test_gestures_change_only_the_view(visit):
         " document.getElementById('values').textContent]"
     )
     page.mouse.move(600, 300)
-    rest(page)
+    settle(page)
     page.mouse.move(3, 3)
-    rest(page)
+    settle(page)
     before = page.evaluate(state)
 
     def view():
@@ -1161,7 +1170,7 @@ def test_gestures_change_only_the_view(visit):
         "keys": lambda: press(page, "Shift+ArrowRight", "Shift+ArrowUp"),
     }
     zooms = {
-        "wheel": lambda: (page.mouse.move(300, 460), page.mouse.wheel(0, -240)),
+        "wheel": lambda: (page.mouse.move(300, 460), wheel(page, -240)),
         "plus": lambda: press(page, "+"),
         "minus": lambda: press(page, "-"),
         "middle button": lambda: drag(page, 0, 60, "middle"),
@@ -1171,7 +1180,7 @@ def test_gestures_change_only_the_view(visit):
         for name, gesture in gestures.items():
             target, direction, distance = view()
             gesture()
-            rest(page)
+            settle(page)
             new_target, new_direction, new_distance = view()
 
             assert (np.abs(new_direction - direction).max() > 0.01) == (kind == "turn"), name
@@ -1179,7 +1188,7 @@ def test_gestures_change_only_the_view(visit):
             if kind != "zoom":
                 assert (np.abs(new_target - target).max() > 0.1) == (kind == "move"), name
             page.mouse.move(3, 3)
-            rest(page)
+            settle(page)
             assert page.evaluate(state) == before, name
     press(page, "0")
     assert page.evaluate(state) == before
@@ -1215,37 +1224,37 @@ def test_solid_page_touch_gestures(visit):
 def test_ids_are_drawn_once_per_view(visit):
     page = visit(solid_page(CAPTURE))
     page.mouse.move(300, 400)
-    rest(page)
+    settle(page)
     before = page.evaluate("foveasim.counts")
     for x in range(300, 560, 13):
         page.mouse.move(x, 420)
-        rest(page)
+        settle(page)
     after = page.evaluate("foveasim.counts")
     assert after["screen"] > before["screen"] + 5
     assert (after["ids"], after["image"]) == (before["ids"], before["image"])
 
     page.click("#theme")
     page.mouse.move(420, 420)
-    rest(page)
+    settle(page)
     dark = page.evaluate("foveasim.counts")
     assert (dark["ids"], dark["image"]) == (after["ids"], after["image"] + 1)
     for step in range(5):
-        page.mouse.wheel(0, -40)
-        rest(page)
+        wheel(page, -40)
+        settle(page)
         now = page.evaluate("foveasim.counts")
         assert now["image"] == dark["image"] + step + 1
         assert now["ids"] <= dark["ids"] + step + 1
     page.mouse.move(3, 3)
-    rest(page)
+    settle(page)
     before = page.evaluate("foveasim.counts")
     drag(page, 50, 50)
     page.mouse.move(3, 3)
-    rest(page)
+    settle(page)
     # Nothing is drawn without interaction.
     quiet = page.evaluate("foveasim.counts")
     assert quiet["image"] > before["image"]
     assert quiet["ids"] <= before["ids"] + 2
-    rest(page)
+    page.evaluate("async () => { for (let k = 0; k < 3; k++) await new Promise(requestAnimationFrame); }")
     assert page.evaluate("foveasim.counts") == quiet
 
 
@@ -1260,7 +1269,7 @@ def test_wheel_approaches_surface_under_mouse(visit):
     until(page, "site => foveasim.hovered === site", site)
     before = page.evaluate("foveasim.camera.distance")
     for _ in range(6):
-        page.mouse.wheel(0, -200)
+        wheel(page, -200)
     until(page, "before => foveasim.camera.distance < 0.12 * before", before)
 
     assert page.evaluate("(p) => foveasim.toWindow(...p)", top) == pytest.approx(position, abs=1.0)
@@ -1279,8 +1288,8 @@ def test_solids_sharp_at_extreme_zoom(visit):
     press(page, "t")
     for _ in range(60):
         page.mouse.move(*page.evaluate("foveasim.toWindow(3, 5, 0)"))
-        page.mouse.wheel(0, -400)
-        rest(page)
+        wheel(page, -400)
+        settle(page)
     x, y = page.evaluate("foveasim.toWindow(3, 5, 0)")
     scale = page.evaluate("foveasim.toWindow(4, 5, 0)")[0] - x
 
@@ -1293,7 +1302,7 @@ def test_solids_sharp_at_extreme_zoom(visit):
 def test_click_and_enter_pin_site(visit):
     page = visit(solid_page(CAPTURE))
     press(page, "t")
-    rest(page)
+    settle(page)
     page.mouse.click(*page.evaluate("(p) => foveasim.toWindow(...p)", [*MOSAIC.centroid_um[41], 0.0]))
     assert page.evaluate("foveasim.pinned") == 41
     page.mouse.move(3, 3)
@@ -1347,7 +1356,7 @@ def test_question_mark_shows_key_list(visit, make):
 def test_lost_graphics_context_is_restored(visit, make):
     page = visit(make(CAPTURE))
     page.evaluate("foveasim.draw && foveasim.draw()")
-    rest(page)
+    settle(page)
     before = page.screenshot()
     canvas = "#cells" if make is web_page else "#solid"
     page.evaluate(
@@ -1358,15 +1367,15 @@ def test_lost_graphics_context_is_restored(visit, make):
     until(page, "!document.querySelector('[role=status]').hidden")
     assert "was lost" in page.inner_text("[role=status]")
     page.mouse.move(300, 300)
-    page.mouse.wheel(0, -100)
-    page.mouse.wheel(0, 100)
+    wheel(page, -100)
+    wheel(page, 100)
     page.mouse.move(3, 3)
     page.evaluate("losing.restoreContext()")
     until(page, "document.querySelector('[role=status]').hidden")
-    rest(page)
+    settle(page)
     if make is solid_page:
         press(page, "0")
-        rest(page)
+        settle(page)
         page.evaluate("document.activeElement.blur()")
         site = page.evaluate("(p) => foveasim.pick(...foveasim.toWindow(...p))", [*MOSAIC.centroid_um[0], 0.1])["site"]
         assert site >= 0
@@ -1374,8 +1383,8 @@ def test_lost_graphics_context_is_restored(visit, make):
         page.click("#fit")
         page.evaluate("document.activeElement.blur()")
         page.mouse.move(3, 3)
-        rest(page)
-    rest(page)
+        settle(page)
+    settle(page)
     assert_alike(page.screenshot(), before)
 
 
@@ -1409,7 +1418,8 @@ def test_solids_fill_high_resolution_screens(visit):
     size = "[document.getElementById('solid').width, document.getElementById('solid').height]"
     for width, height in ((1200, 800), (900, 620), (640, 760)):
         page.set_viewport_size({"width": width, "height": height})
-        rest(page)
+        until(page, "size => innerWidth === size[0] && innerHeight === size[1]", [width, height])
+        settle(page)
         box = page.locator("#map").bounding_box()
         assert page.evaluate(size) == [round(2 * box["width"]), round(2 * box["height"])]
         press(page, "t")
@@ -1428,7 +1438,7 @@ def test_solids_show_colours_on_background(visit, tmp_path, theme, ground):
     layout = fs.layout.mosaic(fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), ("RG", "GB"))
     page = visit(solid_page(layout, solids=solids(layout, SensorStack(lens_height_um=0.0))), color_scheme=theme)
     press(page, "t")
-    rest(page)
+    settle(page)
     (tmp_path / "above.png").write_bytes(page.screenshot())
     picture = read_picture(tmp_path / "above.png")
 
@@ -1461,7 +1471,7 @@ def test_fast_graphics_antialias_solid_edges(visit, tmp_path):
     for name, script in (("slow", None), ("fast", EMULATE_GRAPHICS_CARD)):
         page = visit(solid_page(layout, solids=solids(layout, flat)), script=script)
         press(page, "t")
-        rest(page)
+        settle(page)
         page.evaluate("document.activeElement.blur()")
         # Clipped to exclude the buttons and the scale bar over the view.
         (tmp_path / "edge.png").write_bytes(page.screenshot(clip={"x": 4, "y": 70, "width": 800, "height": 670}))
@@ -1495,10 +1505,10 @@ def test_large_solid_page_sites_are_pickable(visit, n_x, n_y):
     assert page.inner_text("#parts") == f"wells · {12 * layout.n_sites:,} triangles"
     # In a close view most tiles are not visible; those that are visible are complete.
     page.mouse.move(*page.evaluate("foveasim.toWindow(0.1, 0.1, 0)"))
-    rest(page)
+    settle(page)
     for _ in range(8):
-        page.mouse.wheel(0, -400)
-    rest(page)
+        wheel(page, -400)
+    settle(page)
     box = page.locator("#solid").bounding_box()
     corners = [(box["x"] + u * box["width"], box["y"] + v * box["height"]) for u in (0.03, 0.97) for v in (0.03, 0.97)]
     assert page.evaluate("foveasim.camera.distance") < 20.0
@@ -1544,7 +1554,7 @@ def drag_tool(page, key, start_um, end_um):
         if k == 0:
             page.mouse.down()
     page.mouse.up()
-    page.evaluate("() => new Promise(requestAnimationFrame)")
+    settle(page)
 
 
 @pytest.mark.needs("chromium")
@@ -1716,7 +1726,7 @@ def test_solid_page_colours_have_legend(visit):
 def test_solid_page_scale_bar_length(visit):
     page = visit(solid_page(CAPTURE), **SMALL)
     page.evaluate("foveasim.lookDown()")
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    settle(page)
     text = page.inner_text("#scale-bar")
     length_um = page.evaluate("foveasim.scaleBarUm")
     camera = page.evaluate("foveasim.camera")
@@ -1784,8 +1794,7 @@ def test_second_capture_shares_view_and_scale(visit):
     box = page.locator("#second-marks").bounding_box()
     px, py = round(0.5 * box["width"]) + 20, round(0.5 * box["height"]) - 10
     page.mouse.move(box["x"] + px, box["y"] + py)
-    page.mouse.wheel(0, -300)
-    page.evaluate("() => new Promise(requestAnimationFrame)")
+    wheel(page, -300)
     view, other = page.evaluate("[foveasim.view, foveasim.secondView]")
     assert [other[name] for name in ("x", "y", "scale")] == [view[name] for name in ("x", "y", "scale")]
     view = other

@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from waiting import wait_until
 
 import foveasim as fs
 from foveasim.errors import ParameterError
@@ -102,11 +103,8 @@ def show(browser):
 
 
 def until(frame, condition):
-    for _ in range(300):
-        if condition():
-            return
-        frame.evaluate("() => new Promise((done) => setTimeout(done, 20))")
-    pytest.fail("the condition did not come true")
+    # Messages of the page arrive during evaluations.
+    wait_until(lambda: (frame.evaluate("null"), condition())[1], step_s=0.02)
 
 
 def position(page, frame, x_um, y_um):

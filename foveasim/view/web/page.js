@@ -788,6 +788,8 @@ const handle = {
   colour: (site) => state.scale.colour(site),
   centre: (site) => state.sites.centre(site),
   get view() { const { x, y, scale, width, height } = state.map; return { x, y, scale, width, height }; },
+  // Whether all is drawn.
+  get isIdle() { return !asks.map && !asks.marks && !state.overview?.resting; },
   get hovered() { return state.hovered; },
   get pinned() { return state.pinned; },
   get chosen() { return state.rules?.chosen ?? null; },

@@ -307,6 +307,8 @@ const handle = {
   lookDown: () => gestures.look(ABOVE),
   draw: () => state.view.draw(),
   picture: () => viewAsPicture().toDataURL("image/png"),
+  // Whether all is drawn.
+  get isIdle() { return !state.isAsked; },
   get hovered() { return state.view.hovered; },
   get pinned() { return state.pinned; },
   get parts() { return state.view.parts.map((part) => part.name); },
