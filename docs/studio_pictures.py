@@ -24,14 +24,12 @@ LOADED = (
     "document.querySelector('#start img') && [...document.querySelectorAll('#start img')].every((one) => one.complete)"
 )
 SKIP_START = "localStorage.setItem('foveasim-studio-start', 'never')"
-READY = "studio.isReady && !(studio.connection.requests.doneId < studio.connection.requests.lastId)"
+READY = "studio.isIdle"
 
 
 def wait_for_views(page: Page) -> None:
     """Wait until the views show the current settings."""
     page.wait_for_selector("#views.loaded", timeout=TIMEOUT_MS)
-    page.wait_for_function(READY, timeout=TIMEOUT_MS)
-    page.wait_for_timeout(600)
     page.wait_for_function(READY, timeout=TIMEOUT_MS)
 
 
@@ -141,7 +139,7 @@ def lecture(page: Page, directory: Path) -> Path:
     page.click("#freeze")
     put(page, "optics.f_number", "11")
     page.mouse.move(*at(page, 0.5, 0.5))
-    page.wait_for_timeout(1500)
+    page.wait_for_function(READY, timeout=TIMEOUT_MS)
     return download(page, "zip", directory / "lecture.zip")
 
 
