@@ -11,10 +11,11 @@ def _script():
     return (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
 
 
-def violations(page):
-    """Return the serious and critical violations on a page: rule, element, and what is wrong."""
-    page.evaluate(_script())
-    rules = page.evaluate("() => axe.run()")["violations"]
+def violations(page, part="html"):
+    """Return the serious and critical violations of a part of a page, by its selector: rule, element, and what is wrong."""
+    if not page.evaluate("'axe' in window"):
+        page.evaluate(_script())
+    rules = page.evaluate("part => axe.run(part)", part)["violations"]
     return [
         f"{rule['id']}: {node['target'][-1]}: {' '.join(node['failureSummary'].split())}"
         for rule in rules
