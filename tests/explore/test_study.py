@@ -126,32 +126,41 @@ def outcomes(study):
 
 @pytest.mark.slow
 def test_interrupted_study_resumes_identically(tmp_path):
-    def run(n_trials, **options):
-        return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=n_trials, seed=5, **options)
+    """The first ten trials are random, the others depend on them."""
 
-    complete = run(20)
-    interrupted = run(13, storage=tmp_path / "study.db")
+    def run(n_trials, seed=5, **options):
+        return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=n_trials, seed=seed, **options)
+
+    complete = run(14)
+    interrupted = run(11, storage=tmp_path / "study.db")
     interrupted.ask()  # a killed program leaves a trial in the running state
-    again = run(20, storage=tmp_path / "study.db")
+    again = run(14, storage=tmp_path / "study.db")
 
     assert outcomes(again) == outcomes(complete)
-    assert len(again.trials) == 21
-    assert outcomes(run(20, storage=f"sqlite:///{tmp_path}/study.db")) == outcomes(complete)
-    assert outcomes(explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=20, seed=6)) != outcomes(complete)
+    assert len(again.trials) == 15
+    assert outcomes(run(14, storage=f"sqlite:///{tmp_path}/study.db")) == outcomes(complete)
+    assert outcomes(run(14, seed=6)) != outcomes(complete)
+
+
+def batches(**options):
+    """Run a study in batches, of which the last depends on the results of the others."""
+    return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=16, seed=5, batch=4, **options)
+
+
+@pytest.fixture(scope="module")
+def complete_batches():
+    return outcomes(batches())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n_workers", [1, 2])
-def test_batches_do_not_depend_on_workers(n_workers):
-    def run(**options):
-        return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=24, seed=5, batch=6, **options)
-
-    assert outcomes(run(workers=n_workers)) == outcomes(run())
+def test_batches_do_not_depend_on_workers(n_workers, complete_batches):
+    assert outcomes(batches(workers=n_workers)) == complete_batches
 
 
 def test_batch_size_changes_the_search():
     one, many = (
-        explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=24, seed=5, batch=batch) for batch in (1, 12)
+        explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=14, seed=5, batch=batch) for batch in (1, 14)
     )
 
     # The first trials are random in any case.
@@ -160,12 +169,9 @@ def test_batch_size_changes_the_search():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stopped_at", [13, 17, 18])
-def test_interrupted_batch_resumes_bit_identically(stopped_at, tmp_path, monkeypatch):
-    def run(**options):
-        return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=24, seed=5, batch=6, **options)
-
-    complete = run()
+@pytest.mark.parametrize("stopped_at", [12, 13, 15])
+def test_interrupted_batch_resumes_bit_identically(stopped_at, tmp_path, monkeypatch, complete_batches):
+    """Before the last batch, after its first trial, and before its last one."""
     store_result, n_stored = study._store_result, []
 
     def interrupted(*args):
@@ -176,10 +182,10 @@ def test_interrupted_batch_resumes_bit_identically(stopped_at, tmp_path, monkeyp
 
     monkeypatch.setattr(study, "_store_result", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        run(storage=tmp_path / "study.db")
+        batches(storage=tmp_path / "study.db")
     monkeypatch.undo()
 
-    assert outcomes(run(storage=tmp_path / "study.db")) == outcomes(complete)
+    assert outcomes(batches(storage=tmp_path / "study.db")) == complete_batches
 
 
 def test_trials_must_be_multiple_of_batch():
@@ -345,16 +351,16 @@ def test_best_table_prints_typed_choices():
 
 
 def test_study_of_other_plan_is_unchanged(tmp_path):
-    explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=2, storage=tmp_path / "s.db")
+    explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=1, storage=tmp_path / "s.db")
 
     with pytest.raises(FileError, match=r"belongs to another sweep or study: 'search\.exposure_s' differs"):
         explore.study(
-            SHOT, SEARCH | {"exposure_s": (1e-5, 1.0)}, {"snr_mean": "maximize"}, n_trials=2, storage=tmp_path / "s.db"
+            SHOT, SEARCH | {"exposure_s": (1e-5, 1.0)}, {"snr_mean": "maximize"}, n_trials=1, storage=tmp_path / "s.db"
         )
     with pytest.raises(FileError, match="contains a study 'study' with other objectives"):
-        explore.study(SHOT, SEARCH, {"snr_mean": "minimize"}, n_trials=2, storage=tmp_path / "s.db")
-    other = explore.study(SHOT, SEARCH, {"snr_mean": "minimize"}, n_trials=2, storage=tmp_path / "s.db", name="other")
-    assert len(other.trials) == 2
+        explore.study(SHOT, SEARCH, {"snr_mean": "minimize"}, n_trials=1, storage=tmp_path / "s.db")
+    other = explore.study(SHOT, SEARCH, {"snr_mean": "minimize"}, n_trials=1, storage=tmp_path / "s.db", name="other")
+    assert len(other.trials) == 1
 
 
 @pytest.mark.parametrize(

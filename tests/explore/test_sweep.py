@@ -19,7 +19,7 @@ import pytest
 import xarray as xr
 from waiting import DEADLINE_S, has_ended, wait_until
 
-from foveasim import explore
+from foveasim import cli, explore
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, FileError, ParameterError, SimulationError
 from foveasim.explore._records import Journal, Record, journal_path, to_values
@@ -175,8 +175,8 @@ def test_integer_keys_equal_string_keys():
     assert coefficients["zernike"]["coefficients"] == {"4": 0.3, "7": 0.2}
 
 
-@pytest.mark.slow(keep=1)
-@pytest.mark.parametrize("workers", [0, 1, 2, 4])
+@pytest.mark.slow(keep=("[1]",))
+@pytest.mark.parametrize("workers", [0, 1, 3])
 def test_results_do_not_depend_on_workers(workers, reference_results, tmp_path):
     found = explore.run_sweep(plan_200(), out=tmp_path / "r.zarr", workers=workers)
 
@@ -275,9 +275,9 @@ def test_results_are_equal_on_external_scheduler(scheduler, reference_results):
     assert_identical(found, reference_results)
 
 
-@pytest.fixture(params=["1 process", "2 processes", "1 worker of a scheduler", "2 workers of a scheduler"])
+@pytest.fixture
 def where(request):
-    """Options of a sweep that select its workers."""
+    """Options of a sweep that select its workers, from words such as "2 workers of a scheduler"."""
     n_workers = int(request.param[0])
     if "process" in request.param:
         yield {"workers": n_workers}
@@ -287,6 +287,7 @@ def where(request):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("where", ["1 process", "1 worker of a scheduler"], indirect=True)
 def test_crashing_metric_fails_only_its_point(where, tmp_path):
     (log,) = logging_metric(tmp_path).values()
 
@@ -311,6 +312,7 @@ def test_crashing_metric_fails_only_its_point(where, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("where", ["2 processes", "2 workers of a scheduler"], indirect=True)
 def test_points_of_killed_worker_are_retried(where, tmp_path):
     metrics = logging_metric(tmp_path, SLOW_S)
     (tmp_path / "held").write_text("16")
@@ -1134,6 +1136,7 @@ def test_missing_main_guard_is_reported_once(tmp_path):
 
     assert result.returncode == 1
     assert result.stderr.count("Traceback") == 1
+    assert "SimulationError: the workers did not start" in result.stderr
     assert 'make the call under if __name__ == "__main__":' in result.stderr.splitlines()[-1]
 
 
@@ -1162,16 +1165,20 @@ def test_file_and_call_give_equal_plans(directory):
     assert read.dims == ("sensor.bits", "exposure_s", "repeat")
 
 
-@pytest.mark.slow
-def test_sweep_file_imports_no_code(directory):
+def test_sweep_file_imports_no_code(directory, monkeypatch, capsys):
     (directory / "untrusted.py").write_text(f"open({str(directory / 'imported')!r}, 'w')")
     sweep = {"shot": "shot.yaml", "vary": {"sensor.bits": [8]}, "metrics": ["untrusted:metric"]}
     (directory / "bad.yaml").write_text(json.dumps(sweep))
-    result = subprocess.run([*COMMAND[:4], "bad.yaml"], cwd=directory, capture_output=True, text=True, check=False)
+    monkeypatch.chdir(directory)
+    monkeypatch.syspath_prepend(directory)
+    monkeypatch.setattr(sys, "argv", ["foveasim", "sweep", "bad.yaml"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    printed = capsys.readouterr().err
 
-    assert result.returncode == 2
-    assert "'metrics' must be names of metrics" in result.stderr
-    assert len(result.stderr.splitlines()) == 1
+    assert ended.value.code == 2
+    assert "'metrics' must be names of metrics" in printed
+    assert len(printed.splitlines()) == 1
     assert not (directory / "imported").exists()
 
 
