@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import scipy.constants
 import scipy.special
-import scipy.stats
 
 import foveasim as fs
 from foveasim._core.validation import read_only
@@ -17,7 +16,7 @@ from foveasim.sensor import Diffusion, InterPixelCapacitance, Sensor
 from foveasim.sensor.model.prediction import NO_TABLES, ChargeDistributions, ChargeTables
 
 SIGMAS = 5.0
-N_DRAWS = 2000
+N_DRAWS = 500
 ONE_E_PER_CODE = {"bits": 16, "v_sat_v": 3.0, "capacitance_f": 65_536 * scipy.constants.e / 3.0}
 
 
@@ -36,9 +35,22 @@ def draw_codes(sensor, expected_e, n_draws=N_DRAWS):
 
 
 def assert_agree(sensor, expected_e):
-    """Check mean and variance of each site to five standard errors, which are estimated from the draws."""
+    """
+    Check mean and variance to five standard errors, which are estimated from the draws.
+
+    Those of each site, and of sums over the sites of similar charges, since frames are independent.
+    """
     mean_dn, variance_dn2 = sensor.predict(expected_e)
     codes = draw_codes(sensor, expected_e)
+    off = codes - mean_dn
+    for sites in np.split(np.argsort(expected_e, kind="stable"), 11 if expected_e.size % 11 == 0 else 1):
+        # Rare codes need more frames.
+        sites = sites[variance_dn2[sites] > 1e-2]
+        sums, squares = off[:, sites].sum(axis=1), (off[:, sites] ** 2 - variance_dn2[sites]).sum(axis=1)
+        # Squares of a code with two values of probability 1/2 are constant.
+        for values, unit in ((sums, np.sqrt(variance_dn2)), (squares, variance_dn2)):
+            rounding = 1e-5 * unit[sites].sum()
+            assert abs(values.mean()) <= SIGMAS * values.std() / np.sqrt(N_DRAWS) + rounding
     mean_error = np.sqrt(variance_dn2 / N_DRAWS) + 1e-3 / np.sqrt(N_DRAWS)
     excess = (codes - codes.mean(axis=0)) ** 2
     # The second term is the error of the sample mean, squared: the only one of a code with two values of probability 1/2.
@@ -52,7 +64,7 @@ def assert_agree(sensor, expected_e):
     assert off_mean.max() < SIGMAS + 1.0 * is_nearly_constant.any()
     assert off_variance[~is_nearly_constant].max(initial=0.0) < SIGMAS
     assert np.sqrt(np.mean(off_mean[~is_nearly_constant] ** 2)) < 1.5
-    assert (~is_nearly_constant).mean() > 0.15
+    assert (~is_nearly_constant).mean() > 0.09
 
 
 ALL_EFFECTS = {
@@ -72,7 +84,7 @@ ALL_EFFECTS = {
     "full_well_e": 5000.0,
 }
 #: Zero, a few electrons, mid-range, near the full well, far above it.
-PHOTO_E = np.repeat([0.0, 0.5, 3.0, 40.0, 99.0, 101.0, 900.0, 3000.0, 4950.0, 5100.0, 20_000.0], 7)
+PHOTO_E = np.repeat([0.0, 0.5, 3.0, 40.0, 99.0, 101.0, 900.0, 3000.0, 4950.0, 5100.0, 20_000.0], 14)
 
 
 @pytest.mark.slow(keep=2)
@@ -127,7 +139,7 @@ def charge_probabilities(mean_e):
     if mean_e > 5e3:
         probability = np.diff(scipy.special.pdtr(np.append(charge[0] - 1, charge), mean_e))
     else:
-        probability = scipy.stats.poisson.pmf(charge, mean_e)
+        probability = np.exp(scipy.special.xlogy(charge, mean_e) - mean_e - scipy.special.gammaln(charge + 1.0))
     return charge, probability / probability.sum()
 
 
@@ -176,7 +188,7 @@ def test_noise_free_prediction_matches_many_draws(dn_per_e):
     n_sites = 200_000
     sensor = sensor_at(dn_per_e, n_sites)
     for k, mean_e in enumerate(CHARGES_E[1:]):
-        mean_dn, variance_dn2 = (part[0] for part in sensor.predict(np.full(n_sites, mean_e)))
+        mean_dn, variance_dn2 = (part[0] for part in sensor_at(dn_per_e).predict(np.array([mean_e])))
         electrons = sensor.collect(np.full(n_sites, mean_e), seed=3, frame=k)
         codes = sensor.read(electrons, seed=3, frame=k).astype(float)
         fourth = np.mean((codes - codes.mean()) ** 4)
@@ -409,8 +421,13 @@ def test_camera_prediction_matches_captures():
     camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
     mean_dn, variance_dn2 = camera.predict(scene, exposure_s=0.02)
 
-    frames = np.stack([camera.capture(scene, exposure_s=0.02, seed=1, frame=k).code for k in range(400)]).astype(float)
+    n_frames = 100
+    frames = np.stack([camera.capture(scene, exposure_s=0.02, seed=1, frame=k).code for k in range(n_frames)]).astype(
+        float
+    )
 
-    off = (frames.mean(axis=0) - mean_dn) / np.sqrt(variance_dn2 / 400)
+    off = (frames.mean(axis=0) - mean_dn) / np.sqrt(variance_dn2 / n_frames)
     assert np.abs(off).max() < SIGMAS
-    assert frames.var(axis=0).sum() == pytest.approx(variance_dn2.sum(), rel=0.05)
+    # Sites are independent: the relative standard error of a variance.
+    error = np.sqrt(2.0 * (variance_dn2**2).sum() / n_frames) / variance_dn2.sum()
+    assert frames.var(axis=0, ddof=1).sum() == pytest.approx(variance_dn2.sum(), rel=SIGMAS * error)
