@@ -31,11 +31,11 @@ def compared():
     rng = np.random.default_rng(7)
     pictures = {f"{k}": synthetic_photograph(rng) for k in range(N_SCENES)}
     layouts = {
-        "foveal": fs.layout.log_polar(n_sectors=32, n_rings=12, r_min_um=4.0, r_max_um=40.0),
-        "square": fs.layout.grid(n_x=20, size_um=(80.0, 80.0)),
+        "foveal": fs.layout.log_polar(n_sectors=16, n_rings=6, r_min_um=4.0, r_max_um=40.0),
+        "square": fs.layout.grid(n_x=10, size_um=(80.0, 80.0)),
     }
     scenes = fs.compare.photograph_scenes(80.0, pictures=pictures)
-    return fs.compare.layouts(layouts, scenes, n_annuli=2, max_pixels=40, tolerance=0.1)
+    return fs.compare.layouts(layouts, scenes, n_annuli=2, max_pixels=24, tolerance=0.1)
 
 
 def coverage(population, n):

@@ -43,9 +43,10 @@ def assert_agree(sensor, expected_e):
     mean_dn, variance_dn2 = sensor.predict(expected_e)
     codes = draw_codes(sensor, expected_e)
     off = codes - mean_dn
-    for sites in np.split(np.argsort(expected_e, kind="stable"), 11 if expected_e.size % 11 == 0 else 1):
-        # Rare codes need more frames.
-        sites = sites[variance_dn2[sites] > 1e-2]
+    # Rare codes need more frames.
+    is_common = variance_dn2 > 1e-2
+    for group in np.split(np.argsort(expected_e, kind="stable"), 11 if expected_e.size % 11 == 0 else 1):
+        sites = group[is_common[group]]
         sums, squares = off[:, sites].sum(axis=1), (off[:, sites] ** 2 - variance_dn2[sites]).sum(axis=1)
         # Squares of a code with two values of probability 1/2 are constant.
         for values, unit in ((sums, np.sqrt(variance_dn2)), (squares, variance_dn2)):
