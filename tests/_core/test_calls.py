@@ -21,15 +21,6 @@ from foveasim.errors import ArgumentError, ParameterError
 from foveasim.layout import LAYOUTS, layout_family
 from foveasim.layout.generators.grid import grid as grid_of_module
 
-MODULES = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "generated_pages.py"))["MODULES"]
-#: Packages inside the documented ones, from which their names can be imported, too.
-PACKAGES = [
-    item.name
-    for module in MODULES
-    if hasattr(import_module(module), "__path__") and module not in ("foveasim", "foveasim.learn")
-    for item in pkgutil.iter_modules(import_module(module).__path__, f"{module}.")
-    if item.ispkg and "._" not in item.name and hasattr(import_module(item.name), "__all__")
-]
 SITES = fs.layout.grid(3, 3, 2.0)
 GRID = r"grid\(n_x=None, n_y=None, pitch_um=None, \*, size_um=None, .*\)"
 
@@ -85,9 +76,22 @@ def test_variadic_arguments_accept_any_name():
         collect(x=1)
 
 
+def public_packages():
+    """Return the documented modules, and the packages inside them, from which their names can be imported, too."""
+    modules = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "generated_pages.py"))["MODULES"]
+    packages = [
+        item.name
+        for module in modules
+        if hasattr(import_module(module), "__path__") and module not in ("foveasim", "foveasim.learn")
+        for item in pkgutil.iter_modules(import_module(module).__path__, f"{module}.")
+        if item.ispkg and "._" not in item.name and hasattr(import_module(item.name), "__all__")
+    ]
+    return [*modules, *packages]
+
+
 def public_functions():
     """Yield public functions, constructors and methods with their names."""
-    for name in (*MODULES, *PACKAGES):
+    for name in public_packages():
         module = import_module(name)
         for public in module.__all__:
             item = getattr(module, public)

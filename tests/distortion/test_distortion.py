@@ -25,7 +25,7 @@ from foveasim.errors import ConfigError, FileError, GeometryError, ParameterErro
 
 cv2 = pytest.importorskip("cv2")
 
-relaxed = settings(max_examples=examples(40))
+relaxed = settings(max_examples=examples(30))
 SIZE = (1920, 1080)
 PIXEL_UM = 2.2
 
@@ -51,11 +51,10 @@ def to_um(pixels):
 # -- Brown-Conrady ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_inverse_is_accurate_for_random_coefficients():
     rng = np.random.default_rng(1)
     worst_px = 0.0
-    for i in range(1000):
+    for i in range(200):
         tangential = rng.normal(0, 0.02, 2) * (i % 4 == 0)
         lens = BrownConrady(
             focal_um=1000.0, k1=rng.normal(0, 0.3), k2=rng.normal(0, 0.2), k3=rng.normal(0, 0.1) * (i % 2),
