@@ -23,7 +23,7 @@ HORSESHOE = shapely.Polygon([(30, 0), (39, 0), (39, 9), (37, 9), (37, 2), (32, 2
 LAYOUTS = {
     "squares": lambda: fs.layout.mosaic(fs.layout.grid(n_x=12, n_y=9, pitch_um=2.0), ("RG", "GB")),
     "hexagons": lambda: fs.layout.hexagonal(n_columns=10, n_rows=10, pitch_um=2.5),
-    "rings with arcs": lambda: fs.layout.log_polar(n_sectors=40, min_size_um=2.0, r_max_um=60.0, stagger=True, chords_per_arc=3),
+    "rings with arcs": lambda: fs.layout.log_polar(n_sectors=24, min_size_um=2.0, r_max_um=54.7, stagger=True, chords_per_arc=3),
     "zones": lambda: fs.layout.node(fs.layout.zones(side_um=(8, 16, 32), pitch_um=(1, 2, 4))),
     "Voronoi, far from the origin": lambda: fs.layout.voronoi(n_sites=150, size_um=(30.0, 30.0), seed=3).translate(4000.0, -9000.0),
     "gaps": lambda: fs.layout.grid(n_x=5, n_y=5, pitch_um=3.0, trench_um=0.6),
@@ -147,8 +147,8 @@ def test_fill_factor_matches_layout():
 
 
 @pytest.mark.slow
-def test_ten_thousand_sites_closed_without_overlap():
-    layout = fs.layout.grid(n_x=100, n_y=100, pitch_um=4.0)
+def test_many_sites_closed_without_overlap():
+    layout = fs.layout.grid(n_x=50, n_y=40, pitch_um=4.0)
     model = solids(layout, SensorStack(trench_width_um=0.4))
     report = model.check()
 
@@ -156,9 +156,9 @@ def test_ten_thousand_sites_closed_without_overlap():
     assert all(as_trimesh(mesh).is_watertight for mesh in model.meshes)
     assert max(report.overlap_um3.values()) < 1e-9
     assert model.fill_factor == pytest.approx(0.81, rel=1e-9)
-    assert report.parts[0].volume_um3 == pytest.approx(10_000 * 3.6**2 * 3.0, rel=1e-9)
-    assert report.parts[1].volume_um3 == pytest.approx(10_000 * (16.0 - 3.6**2) * 3.0, rel=1e-9)
-    assert report.parts[2].volume_um3 == pytest.approx(10_000 * 16.0 * 0.6, rel=1e-9)
+    assert report.parts[0].volume_um3 == pytest.approx(2000 * 3.6**2 * 3.0, rel=1e-9)
+    assert report.parts[1].volume_um3 == pytest.approx(2000 * (16.0 - 3.6**2) * 3.0, rel=1e-9)
+    assert report.parts[2].volume_um3 == pytest.approx(2000 * 16.0 * 0.6, rel=1e-9)
 
 
 def test_check_detects_overlaps_and_open_surfaces():
@@ -267,9 +267,18 @@ def test_invalid_thicknesses_raise_by_name(parameters, message):
 # -- cuts ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow(keep=5)
-@pytest.mark.parametrize("name", ["squares", "rings with arcs", "zones"])
-@pytest.mark.parametrize("shape", ["quarter", "slanted", "disc", "two pieces"])
+@pytest.mark.slow(keep=4)
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("squares", "quarter"),
+        ("squares", "two pieces"),
+        ("rings with arcs", "slanted"),
+        ("rings with arcs", "disc"),
+        ("zones", "quarter"),
+        ("zones", "disc"),
+    ],
+)
 def test_cut_solids_closed_with_remaining_volume(name, shape):
     layout = LAYOUTS[name]()
     x0, y0, x1, y1 = layout.bounds_um

@@ -516,7 +516,7 @@ def test_right_click_finds_visible_site():
     plot.show(auto_close=False)
     mesh = plot.actors["columns"].mapper.dataset
     own, picked, is_orange = mesh.cell_data["rgb"].copy(), set(), []
-    for x, y in itertools.product(range(20, 250, 17), range(20, 190, 13)):
+    for x, y in itertools.product(range(20, 250, 23), range(20, 190, 17)):
         plot.iren.picker.Pick(x, y, 0, plot.renderer)
         text = plot.actors["picked site"].GetInput()
         cells = np.flatnonzero((mesh.cell_data["rgb"] != own).any(axis=1))

@@ -11,6 +11,7 @@ import json
 import re
 import sys
 from dataclasses import replace
+from functools import cache
 from html.parser import HTMLParser
 from importlib.resources import files
 
@@ -728,7 +729,7 @@ def test_page_fits_small_windows(visit, size):
 
 
 @pytest.mark.needs("chromium")
-@pytest.mark.parametrize(("n_x", "n_y"), [(100, 100), (500, 400)])
+@pytest.mark.parametrize(("n_x", "n_y"), [(100, 100), (300, 250)])
 def test_large_layout_sites_are_pickable(visit, n_x, n_y):
     layout = fs.layout.grid(n_x=n_x, n_y=n_y, pitch_um=1.5)
     capture = capture_of(layout, filters=("all",))
@@ -951,21 +952,28 @@ def in_one_order(triangles_um, sites, *more):
     return turned[order], *(values[order] for values in (sites, *more))
 
 
-BIG = fs.layout.mosaic(fs.layout.grid(n_x=90, n_y=70, pitch_um=2.0), ("RG", "GB"))
+def big():
+    return fs.layout.mosaic(fs.layout.grid(n_x=90, n_y=70, pitch_um=2.0), ("RG", "GB"))
 
 
 @pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
-    ("layout", "meshes", "n_tiles"),
+    ("make", "build", "n_tiles"),
     [
-        (MIXED_LAYOUT, (prisms(MIXED_LAYOUT, np.arange(10.0)),), 1),
-        (MOSAIC, solids(MOSAIC, SensorStack(trench_width_um=0.3)).meshes, 1),
-        (MOSAIC, solids(MOSAIC, SensorStack(trench_width_um=0.3, n_lens_corners=12)).cut().meshes, 1),
-        (BIG, (prisms(BIG, np.arange(6300.0)),), 4),
+        (lambda: MIXED_LAYOUT, lambda layout: (prisms(layout, np.arange(10.0)),), 1),
+        (lambda: MOSAIC, lambda layout: solids(layout, SensorStack(trench_width_um=0.3)).meshes, 1),
+        (
+            lambda: MOSAIC,
+            lambda layout: solids(layout, SensorStack(trench_width_um=0.3, n_lens_corners=12)).cut().meshes,
+            1,
+        ),
+        (big, lambda layout: (prisms(layout, np.arange(6300.0)),), 4),
     ],
     ids=["notches and holes", "stack", "stack cut open", "tiles"],
 )
-def test_packed_surfaces_return_every_triangle(layout, meshes, n_tiles):
+def test_packed_surfaces_return_every_triangle(make, build, n_tiles):
+    layout = make()
+    meshes = build(layout)
     about, arrays = bodies_of(meshes, layout)
     for mesh, (name, triangles_um, sites, rgb) in zip(meshes, surfaces_of(about, arrays), strict=True):
         corners = mesh.triangles
@@ -1036,7 +1044,13 @@ ODD = fs.Layout.from_polygons([
     for i, polygon in enumerate(HEXAGONS.polygons())
 ])  # fmt: skip
 RINGS = fs.layout.log_polar(n_sectors=24, r_min_um=20.0, r_max_um=60.0, stagger=True)
-STACK = solids(MOSAIC, SensorStack(well_depth_um=4.0, trench_width_um=0.5, filter_thickness_um=1.5, lens_height_um=0.0))
+
+
+@cache
+def stack_of_mosaic():
+    return solids(
+        MOSAIC, SensorStack(well_depth_um=4.0, trench_width_um=0.5, filter_thickness_um=1.5, lens_height_um=0.0)
+    )
 
 
 def columns_of(layout):
@@ -1052,7 +1066,7 @@ def stack_prisms():
     ground = MOSAIC.polygons()
     n = MOSAIC.n_sites
     return (
-        solid_page(MOSAIC, solids=STACK),
+        solid_page(MOSAIC, solids=stack_of_mosaic()),
         [
             ("wells", wells, np.full(n, -4.0), np.zeros(n)),
             ("trenches", shapely.difference(ground, wells), np.full(n, -4.0), np.zeros(n)),
@@ -1088,22 +1102,27 @@ VIEWS = {
 @pytest.mark.slow
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize(
-    "build",
-    [lambda: columns_of(MIXED_LAYOUT), lambda: columns_of(ODD), lambda: columns_of(RINGS), stack_prisms],
+    ("build", "views"),
+    [
+        (lambda: columns_of(MIXED_LAYOUT), tuple(VIEWS)),
+        (lambda: columns_of(ODD), ("aside", "low, twice as high")),
+        (lambda: columns_of(RINGS), ("above", "rotated, near, panned")),
+        (stack_prisms, ("aside", "rotated, near, panned", "below", "inside")),
+    ],
     ids=["notches and holes", "hexagons", "log-polar", "stack"],
 )
-def test_picks_match_ray_casting(visit, build):
+def test_picks_match_ray_casting(visit, build, views):
     text, parts, has_floor = build()
     page = visit(text)
     box = page.locator("#solid").bounding_box()
     rng = np.random.default_rng(5)
-    for name, go in VIEWS.items():
+    for name in views:
         page.focus("#solid")
         page.keyboard.press("0")
         page.fill("#height", "0")
-        go(page)
+        VIEWS[name](page)
         camera = page.evaluate("foveasim.camera")
-        pixels = np.floor(rng.uniform((0, 0), (int(box["width"]), int(box["height"])), (250, 2))) + 0.5
+        pixels = np.floor(rng.uniform((0, 0), (int(box["width"]), int(box["height"])), (150, 2))) + 0.5
         positions = pixels + np.array([box["x"], box["y"]])
         found = page.evaluate("points => points.map(([x, y]) => foveasim.pick(x, y))", positions.tolist())
         # Compare pixels within one site without another site at the same depth; at boundaries rounding decides.
@@ -1134,8 +1153,8 @@ def test_picks_match_ray_casting(visit, build):
         ]
 
         assert wrong == []
-        assert is_clear.sum() > 100
-        assert (which[0][is_clear] >= 0).sum() > 25
+        assert is_clear.sum() > 60
+        assert (which[0][is_clear] >= 0).sum() > 15
 
 
 @pytest.mark.slow
@@ -1486,17 +1505,17 @@ def test_fast_graphics_antialias_solid_edges(visit, tmp_path):
 
 
 @pytest.mark.needs("chromium")
-@pytest.mark.parametrize(("n_x", "n_y"), [(100, 100), (500, 400)])
+@pytest.mark.parametrize(("n_x", "n_y"), [(60, 50), (300, 250)])
 def test_large_solid_page_sites_are_pickable(visit, n_x, n_y):
     layout = fs.layout.grid(n_x=n_x, n_y=n_y, pitch_um=1.5)
     wells = solids(layout, SensorStack(trench_width_um=0.0, filter_thickness_um=0.0, lens_height_um=0.0))
-    page = visit(solid_page(layout, solids=wells))
+    page = visit(solid_page(layout, solids=wells), viewport={"width": 760, "height": 520})
     page.evaluate("foveasim.lookDown()")
     sites = np.random.default_rng(1).integers(0, layout.n_sites, 100)
     positions = np.column_stack((layout.centroid_um[sites], np.zeros(sites.size))).tolist()
     found = page.evaluate("places => places.map((p) => foveasim.pick(...foveasim.toWindow(...p)).site)", positions)
 
-    if n_x == 100:
+    if n_x == 60:
         assert found == sites.tolist()
     else:
         # A site covers one or two pixels.
@@ -1662,7 +1681,7 @@ def overview_of(page):
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize("by", ["size_um", "channel"])
 def test_overview_shows_exact_area_means(visit, by):
-    layout = fs.layout.voronoi(n_sites=900, size_um=(30.0, 20.0), seed=2)
+    layout = fs.layout.voronoi(n_sites=900, size_um=(30.0, 20.0), n_iterations=2, seed=2)
     layout = fs.layout.random_channels(layout, (0.5, 0.3, 0.2), seed=1)
     page = visit(web_page(layout), hash_text=f"#by={by}", viewport={"width": 400, "height": 420})
     picture, bounds_um = overview_of(page)
