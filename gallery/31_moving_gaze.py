@@ -29,17 +29,17 @@ FRAME_MS, REST_MS = 160, 700
 N_PIXELS = 640
 RING_UM = 150.0
 #: Frames for a test of the script.
-QUICK = {"n_stops": 2}
+QUICK = {"n_stops": 2, "n_moving": 1}
 
 
-def gaze_path(n_stops: int) -> tuple[np.ndarray, list[int]]:
+def gaze_path(n_stops: int, n_moving: int) -> tuple[np.ndarray, list[int]]:
     """Return gazes (n_frame, 2) in µm along a closed path with smooth starts and ends, and durations in ms."""
     stops_um = 2.0 * first.HALF_UM * (np.array(STOPS[:n_stops]) - 0.5) * (1.0, -1.0)
     gazes, durations_ms = [], []
     for begin, end in zip(stops_um, np.roll(stops_um, -1, axis=0), strict=True):
         gazes.append(begin)
         durations_ms.append(REST_MS)
-        for step in np.arange(1, N_MOVING + 1) / (N_MOVING + 1):
+        for step in np.arange(1, n_moving + 1) / (n_moving + 1):
             gazes.append(begin + (end - begin) * (3.0 - 2.0 * step) * step**2)
             durations_ms.append(FRAME_MS)
     return np.array(gazes), durations_ms
@@ -63,12 +63,12 @@ def frame(scene: fs.Scene, gaze_um: np.ndarray, exposure_s: float, seed: int) ->
     return image, layout.n_sites, n_near
 
 
-def main(out_dir: Path, n_stops: int = len(STOPS)) -> None:
+def main(out_dir: Path, n_stops: int = len(STOPS), n_moving: int = N_MOVING) -> None:
     """Write the animation to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
     # %% Scene and exposure are fixed; each gaze has its own photosites.
     scene = first.photograph()
-    gazes_um, durations_ms = gaze_path(n_stops)
+    gazes_um, durations_ms = gaze_path(n_stops, n_moving)
     exposure_s = first.three_chips(first.foveal_layout(tuple(gazes_um[0]))).auto_exposure(scene)
     frames, counts, near = zip(
         *(frame(scene, gaze_um, exposure_s, seed) for seed, gaze_um in enumerate(gazes_um)), strict=True

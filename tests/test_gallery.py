@@ -24,6 +24,8 @@ PARAMETERS = [
 ]
 #: Width at which the site shows a figure: 736 pixels of 1/96 inch; and the smallest text there.
 SHOWN_INCHES, MIN_TEXT_PT = 736 / 96, 9.0
+#: Resolution of the figures of these tests, which look at no pixels.
+DOTS_PER_INCH = 40.0
 
 
 @pytest.mark.slow(keep=("02_light", "25_own", "16_four"))
@@ -37,7 +39,7 @@ def test_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
         scale = min(1.0, SHOWN_INCHES / figure.get_size_inches()[0])
         texts = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip()]
         small.extend(f"{path.name}: {text.get_text()!r}" for text in texts if scale * text.get_size() < MIN_TEXT_PT)
-        save(figure, path, dpi=dpi)
+        save(figure, path, dpi=min(dpi, DOTS_PER_INCH))
 
     monkeypatch.setattr(foveasim.view, "save_figure", save_and_measure)
     spec = importlib.util.spec_from_file_location(f"gallery_{path.stem}", path)

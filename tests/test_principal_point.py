@@ -66,10 +66,15 @@ def opencv_file(path, matrix, coefficients, model):
     return read_calibration(path, pixel_um=PIXEL_UM)
 
 
-@pytest.mark.slow(keep=3)
-@pytest.mark.parametrize("source", ["arrays", "file"])
-@pytest.mark.parametrize("model", ["plumb_bob", "fisheye"])
-@pytest.mark.parametrize("focal_px", [(FOCAL_PX, FOCAL_PX), (1.03 * FOCAL_PX, FOCAL_PX / 1.03)])
+@pytest.mark.parametrize(
+    ("source", "model", "focal_px"),
+    [
+        ("arrays", "plumb_bob", (FOCAL_PX, FOCAL_PX)),
+        ("arrays", "fisheye", (1.03 * FOCAL_PX, FOCAL_PX / 1.03)),
+        ("file", "plumb_bob", (1.03 * FOCAL_PX, FOCAL_PX / 1.03)),
+        ("file", "fisheye", (FOCAL_PX, FOCAL_PX)),
+    ],
+)
 def test_points_land_where_opencv_projects_them(tmp_path, source, model, focal_px):
     matrix, k = matrix_of(focal_px), np.array(FISHEYE if model == "fisheye" else BROWN_CONRADY)
     if source == "file":

@@ -153,7 +153,7 @@ def _check_format(
     require(form.matches_file(path, b"" if path.is_dir() else path.read_bytes()[:1024]), "must match its own files")
     wrong = difference(read(path, **options), expected)
     require(not wrong, wrong)
-    if form.write is not None and write is not None:
+    if form.write is not None and write is not None and callable(extension.example):
         again = path.with_name(f"again{path.suffix}")
         write(again)
         wrong = difference(read(again), standard)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -389,14 +390,17 @@ def test_invalid_framing_names_its_key(shot_file, change, message):
         read_shot(shot_file, change.split("; "))
 
 
+@cache
+def validator_of(kind, version):
+    """Return the validator of a kind of file with the design rules of a version of their registry."""
+    return pytest.importorskip("jsonschema").Draft202012Validator(schema(kind))
+
+
 def errors_of(kind, data):
     """Return the errors of plain data by the JSON schema of a kind of file."""
-    jsonschema = pytest.importorskip("jsonschema")
-    validator = jsonschema.Draft202012Validator(schema(kind))
-    return [error.message for error in validator.iter_errors(data)]
+    return [error.message for error in validator_of(kind, fs.layout.RULES.version).iter_errors(data)]
 
 
-@pytest.mark.slow(keep=5)
 @pytest.mark.parametrize("name", sorted(bundled_layouts()))
 def test_bundled_layout_satisfies_schema(name):
     data = read_yaml(bundled_layouts()[name])

@@ -11,6 +11,7 @@ import tomllib
 from importlib.metadata import distribution
 from pathlib import Path
 
+from matplotlib import get_configdir
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[2]
@@ -58,7 +59,13 @@ def make_environment(directory, extra=None):
 def run_calls(python, directory, names=(), **variables):
     """Make calls in an environment, with environment variables, and return their outcomes."""
     report = directory / "report.json"
-    env = {"PATH": "/usr/bin:/bin", "HOME": str(directory), "MPLBACKEND": "agg", **variables}
+    env = {
+        "PATH": "/usr/bin:/bin",
+        "HOME": str(directory),
+        "MPLBACKEND": "agg",
+        "MPLCONFIGDIR": get_configdir(),
+        **variables,
+    }
     ran = subprocess.run(
         [str(python), "-P", str(CALLS), "--report", str(report), *names],
         env=env, cwd=directory, capture_output=True, text=True, timeout=LIMIT_S, check=False,
