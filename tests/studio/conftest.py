@@ -134,7 +134,7 @@ def visit(server, browser):
             page.on("console", lambda message: problems.append(message.text))
         page.on("pageerror", lambda error: problems.append(str(error)))
         page.goto(address or server.address)
-        if options.get("bypass_csp", True) and address is None:  # otherwise the page refuses to poll conditions
+        if options.get("bypass_csp", True) and address is None:  # otherwise its policy forbids to poll conditions
             settle(page)
         return page
 
