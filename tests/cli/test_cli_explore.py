@@ -234,16 +234,6 @@ if any("multiprocessing.forkserver" in argument for argument in sys.orig_argv):
         time.sleep(0.01)
 """
 #: Shards of a dataset are stored only until there are three, while the file ``held`` exists.
-HELD_SHARDS = """
-import os, time
-from pathlib import Path
-replace = os.replace
-def held(source, target, **options):
-    while str(target).endswith(".tar") and os.path.exists("held") and len(list(Path("dataset").glob("*.tar"))) >= 3:
-        time.sleep(0.01)
-    return replace(source, target, **options)
-os.replace = held
-"""
 
 
 def at_start(folder, script):
@@ -644,15 +634,8 @@ def test_interrupted_dataset_resumes_identically(folder):
     (folder / "long.yaml").write_text(json.dumps(DATA_SET | {"cameras": 100, "per_shard": 10}))
     command = [sys.executable, "-m", "foveasim.cli", "dataset", "long.yaml", "--workers", "2"]
     shards = lambda: {p.name: p.stat().st_mtime_ns for p in (folder / "dataset").glob("*.tar")}  # noqa: E731
-    (folder / "held").touch()
     running = subprocess.Popen(
-        command,
-        cwd=folder,
-        env=os.environ | at_start(folder, HELD_SHARDS),
-        start_new_session=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+        command, cwd=folder, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     wait_until(lambda: len(shards()) >= 2, program=running)
     os.killpg(running.pid, signal.SIGINT)

@@ -472,9 +472,7 @@ NPZ_BOMBS = {
     "long column name with line breaks": lambda: npz(
         **{"column_\n\x1b[31m" + "a" * 60_000: npy("'<i8'", (2,), bytes(16))}
     ),
-    "archive compressed with lzma": lambda: npz(
-        zipfile.ZIP_LZMA, xy_um=npy("'<f8'", (300_000, 2), bytes(4_800_000))
-    ),
+    "archive compressed with lzma": lambda: npz(zipfile.ZIP_LZMA, xy_um=npy("'<f8'", (300_000, 2), bytes(4_800_000))),
     "timestamps out of range": lambda: npz(column_a=npy("'<M8[as]'", (1,), b"\xff" * 8)),
 }
 
