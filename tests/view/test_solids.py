@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import sys
 
-import manifold3d
 import numpy as np
 import pytest
 import shapely
-import trimesh
 
 import foveasim as fs
 from foveasim.errors import FileError, GeometryError, ParameterError
@@ -31,6 +29,8 @@ LAYOUTS = {
 
 
 def as_trimesh(mesh):
+    import trimesh
+
     return trimesh.Trimesh(mesh.points_um, mesh.triangles, process=False)
 
 
@@ -303,6 +303,8 @@ def test_cut_solids_closed_with_remaining_volume(name, shape):
 
 
 def test_cut_lens_volume_matches_manifold3d():
+    import manifold3d
+
     model = solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=4.0), STACK)
     region = shapely.box(-1.0, -5.0, 5.0, 1.2)
     lenses = model.parts["lenses"]
@@ -386,6 +388,8 @@ def model():
 
 
 def test_glb_file_preserves_faces_and_attributes(model, tmp_path):
+    import trimesh
+
     model.write(tmp_path / "sensor.glb")
     loaded = trimesh.load(tmp_path / "sensor.glb", process=False)
 
@@ -402,6 +406,8 @@ def test_glb_file_preserves_faces_and_attributes(model, tmp_path):
 
 @pytest.mark.parametrize("extension", [".stl", ".ply", ".obj", ".3mf"])
 def test_other_files_preserve_faces_and_volume(model, extension, tmp_path):
+    import trimesh
+
     model.write(tmp_path / f"sensor{extension}")
     loaded = trimesh.load(tmp_path / f"sensor{extension}", process=False)
     bodies = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
@@ -421,6 +427,8 @@ def test_unknown_extension_raises_without_output(model, tmp_path):
 
 
 def test_failed_export_keeps_existing_file(model, tmp_path, monkeypatch):
+    import trimesh
+
     (tmp_path / "sensor.glb").write_bytes(b"before")
 
     def fail(*_, **__):
