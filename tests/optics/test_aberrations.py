@@ -70,7 +70,7 @@ def test_zernike_polynomials_are_orthonormal():
 
     gram = np.einsum("aij,bij,ij->ab", modes, modes, area, optimize=True)
 
-    assert gram == pytest.approx(np.eye(231), abs=1e-12)
+    np.testing.assert_allclose(gram, np.eye(231), rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_psf_is_independent_of_index_and_unit():
     ]
 
     for psf in psfs[1:]:
-        assert psf == pytest.approx(psfs[0], abs=1e-12)
+        np.testing.assert_allclose(psf, psfs[0], rtol=0.0, atol=1e-12)
 
 
 def test_coefficients_vary_with_wavelength():
@@ -319,12 +319,13 @@ def test_psf_is_exact_at_patch_centre(n_patches):
     )
 
     # The point is within half a cell of the patch centre.
-    assert power_map.data[0] == pytest.approx(reference.data[0], abs=0.02 * reference.data.max())
+    np.testing.assert_allclose(power_map.data[0], reference.data[0], rtol=0.0, atol=0.02 * reference.data.max())
 
 
 @pytest.mark.slow(keep=1)
-@pytest.mark.parametrize("padding_cells", [None, 0, 30])
-@pytest.mark.parametrize("padding", ["reflect", "edge", "zero"])
+@pytest.mark.parametrize(
+    ("padding", "padding_cells"), [("reflect", None), ("edge", 0), ("zero", 30), ("reflect", 30), ("zero", None)]
+)
 def test_patches_with_equal_psfs_match_convolution(padding, padding_cells):
     image = np.random.default_rng(5).random((70, 90)) + 0.5
     options = {"padding": padding, "padding_cells": padding_cells}
@@ -333,17 +334,17 @@ def test_patches_with_equal_psfs_match_convolution(padding, padding_cells):
     patched = map_of(lens(seidel=Seidel(spherical_um=0.3, coma_um=1.0, field_radius_um=1e7), **options), image).data
 
     # The periodic continuation is the same, except for PSF energy beyond the guard of a patch.
-    assert patched == pytest.approx(plain, rel=2e-3)
+    np.testing.assert_allclose(patched, plain, rtol=2e-3)
     assert patched.sum() == pytest.approx(plain.sum(), rel=1e-3)
 
 
 @pytest.mark.slow
 def test_uniform_scene_stays_uniform_with_patches():
-    image = np.ones((400, 420))
+    image = np.ones((120, 140))
     patched = map_of(lens(seidel=Seidel(coma_um=1e-9), padding="reflect"), image, pitch_um=46.4).data
     plain = map_of(lens(padding="reflect"), image, pitch_um=46.4).data
 
-    assert patched == pytest.approx(plain, rel=2e-3)
+    np.testing.assert_allclose(patched, plain, rtol=2e-3)
 
 
 @pytest.mark.slow

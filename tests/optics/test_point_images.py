@@ -30,6 +30,7 @@ PUPILS = {
     "heptagon and slit": ((Blades(7, angle_deg=3.0), Slit(0.6, angle_deg=40.0)), {"n_radial": 40}),
     "picture": ((PupilImage(GREY),), {"n_radial": 24}),
 }
+TERMS = (4, 7, 22, 36)
 
 
 def lens(pupils=(), **coefficients):
@@ -47,8 +48,9 @@ def clear(x, y, wavelength_nm):
 
 
 @pytest.mark.slow(keep=2)
-@pytest.mark.parametrize("term", [4, 7, 22, 36])
-@pytest.mark.parametrize("name", PUPILS)
+@pytest.mark.parametrize(
+    ("name", "term"), [(name, term) for k, name in enumerate(PUPILS) for term in TERMS[k % 2 :: 2]]
+)
 def test_psf_and_strehl_match_polar_quadrature(name, term):
     pupils, accuracy = PUPILS[name]
     optics = lens(pupils, **{f"z{term}": 0.5})
@@ -75,12 +77,16 @@ def test_psf_and_strehl_match_polar_quadrature(name, term):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pupil", [(), (Annulus(0.5),), (Blades(6), Spider(3, 0.02))])
-def test_strehl_matches_quadrature_for_36_terms(pupil):
+@pytest.mark.parametrize(
+    ("pupil", "first"),
+    [((), 2), ((Annulus(0.5),), 3), ((Blades(6), Spider(3, 0.02)), 4)],
+    ids=["circle", "annulus", "star"],
+)
+def test_strehl_matches_quadrature_for_36_terms(pupil, first):
     x, y, weight = pupil_nodes(pupil, n_radial=90)
     for one in pupil:
         weight = weight * one(x, y, WAVELENGTH_NM)
-    for term in range(2, 37):
+    for term in range(first, 37, 3):
         wave = np.exp(1j * np.pi * zernike(*noll_to_nm(term), x, y))
 
         got = lens(pupil, **{f"z{term}": 0.5}).strehl(WAVELENGTH_NM)
@@ -92,9 +98,9 @@ def test_strehl_matches_quadrature_for_36_terms(pupil):
 @pytest.mark.parametrize("name", ["circle", "obstructed", "picture"])
 def test_psf_is_independent_of_window(name):
     optics = lens(PUPILS[name][0], z8=0.5, z36=-0.2)
-    small, large = (optics.psf(WAVELENGTH_NM, n_points=n).psf_per_um2 for n in (65, 1025))
+    small, large = (optics.psf(WAVELENGTH_NM, n_points=n).psf_per_um2 for n in (65, 513))
 
-    assert small == pytest.approx(large[480:545, 480:545], abs=1e-8 * large.max())
+    np.testing.assert_allclose(small, large[224:289, 224:289], rtol=0.0, atol=1e-8 * large.max())
 
 
 # -- optical transfer functions ---------------------------------------------------------------------------------------
@@ -171,7 +177,7 @@ def test_otf_of_picture_is_pixel_correlation():
 def test_otf_is_transform_of_psf():
     """The phase of the OTF has the sign of its definition, also for an asymmetric PSF."""
     optics = lens([Blades(5, angle_deg=11.0)], z7=0.3, z10=0.1, z2=0.2)
-    psf = optics.psf(WAVELENGTH_NM, pitch_um=0.4 * LAMBDA_N_UM, n_points=1001)
+    psf = optics.psf(WAVELENGTH_NM, pitch_um=0.4 * LAMBDA_N_UM, n_points=501)
     s = np.array([0.05, 0.2, 0.5])
 
     got = optics.otf(s / LAMBDA_N_UM * 1e3, WAVELENGTH_NM, angle_deg=40.0)
@@ -180,8 +186,8 @@ def test_otf_is_transform_of_psf():
             enumerate((psf.grid.x_um / LAMBDA_N_UM, psf.grid.y_um / LAMBDA_N_UM)))  # fmt: skip
     energy = psf.psf_per_um2 * psf.grid.cell_area_um2
     expected = np.einsum("ky,yx,kx->k", np.exp(-2j * np.pi * y), energy, np.exp(-2j * np.pi * x), optimize=True)
-    # The energy beyond 200 λN.
-    assert got == pytest.approx(expected, abs=3e-3)
+    # The energy beyond 100 λN: 3e-3 beyond 200 λN, and inversely proportional to the radius.
+    assert got == pytest.approx(expected, abs=6e-3)
 
 
 # -- callables ------------------------------------------------------------------------------------------------------

@@ -144,7 +144,7 @@ def test_sampled_circle_otf_matches_closed_form(n_across):
     otf = Aperture([clear], [], 0.0).compute_otf(550.0, n_across, n + 3, (0.0, 0.0), np.float64)
     s = np.arange(-n - 3, n + 4) / n_across
 
-    assert otf == pytest.approx(circular_otf(np.hypot(s[:, np.newaxis], s)), abs=7e-4)
+    np.testing.assert_allclose(otf, circular_otf(np.hypot(s[:, np.newaxis], s)), rtol=0.0, atol=7e-4)
     assert otf[n + 3, n + 3] == 1.0
 
 
@@ -207,23 +207,23 @@ def test_annulus_psf_is_airy_amplitude_difference(obscuration):
 
     expected = np.pi / 4 * amplitude**2 / (1 - e * e) / LAMBDA_N_UM**2
 
-    assert psf.psf_per_um2 == pytest.approx(expected, abs=1e-9 * expected.max())
+    np.testing.assert_allclose(psf.psf_per_um2, expected, rtol=0.0, atol=1e-9 * expected.max())
 
 
 def test_sampled_circle_psf_is_airy_pattern():
     closed, sampled = (lens(pupil=p).psf(WAVELENGTH_NM, n_points=129) for p in (None, clear))
 
     assert closed.psf_per_um2[64, 64] == pytest.approx(np.pi / 4 / LAMBDA_N_UM**2, rel=1e-9)
-    assert sampled.psf_per_um2 == pytest.approx(closed.psf_per_um2, abs=1e-9 * closed.psf_per_um2.max())
+    np.testing.assert_allclose(sampled.psf_per_um2, closed.psf_per_um2, rtol=0.0, atol=1e-9 * closed.psf_per_um2.max())
 
 
 def test_hexagon_and_three_vanes_give_six_rays():
     # Rays are perpendicular to edges: at 30, 90, 150 ... degrees for the hexagon with a vertex on the x axis.
     for pupil, first_deg in ((Blades(6), 30.0), (Spider(3, 0.03), 90.0)):
-        psf = lens(pupil=pupil).psf(WAVELENGTH_NM, n_points=801, pitch_um=0.25 * LAMBDA_N_UM)
+        psf = lens(pupil=pupil).psf(WAVELENGTH_NM, n_points=401, pitch_um=0.25 * LAMBDA_N_UM)
         x_um, y_um = psf.grid.x_um, psf.grid.y_um[:, np.newaxis]
         radius, angle = np.hypot(x_um, y_um) / LAMBDA_N_UM, np.degrees(np.arctan2(y_um, x_um))
-        is_far = (radius > 25) & (radius < 90)
+        is_far = (radius > 20) & (radius < 50)
         off_ray = np.abs((angle - first_deg + 30.0) % 60.0 - 30.0)
         on, off = (psf.psf_per_um2[is_far & there].mean() for there in (off_ray < 2.0, off_ray > 10.0))
 
@@ -271,7 +271,7 @@ def test_sampled_circle_map_matches_closed_form(cells_per_lambda_n):
         o.power_map(point_scene(o, cells_per_lambda_n, at=[(150, 150), (20, 77)])).data[0] for o in (closed, sampled)
     ]
 
-    assert data[1] == pytest.approx(data[0], abs=5e-4 * data[0].max())
+    np.testing.assert_allclose(data[1], data[0], rtol=0.0, atol=5e-4 * data[0].max())
     assert data[1].sum() == pytest.approx(data[0].sum(), rel=1e-9)
 
 
@@ -282,7 +282,7 @@ def test_point_map_equals_psf():
     fraction = power_map.data[0] / power_map.data.sum()
 
     # Means over cells of λN/12 against samples at their centres; the periodic map contains the total energy.
-    assert fraction == pytest.approx(psf.psf_per_um2 * psf.grid.cell_area_um2, abs=6e-3 * fraction.max())
+    np.testing.assert_allclose(fraction, psf.psf_per_um2 * psf.grid.cell_area_um2, rtol=0.0, atol=6e-3 * fraction.max())
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("single", 1e-5), ("double", 1e-9)])
@@ -320,7 +320,8 @@ def test_weighted_maps_equal_weighted_sum_of_maps(precision):
         collapsed = np.stack(list(optics.weighted_maps(scene, weights)))
 
     expected = np.tensordot(weights, maps, axes=1)
-    assert collapsed == pytest.approx(expected, abs=expected.max() * (3e-6 if precision == "single" else 1e-12))
+    tolerance = 3e-6 if precision == "single" else 1e-12
+    np.testing.assert_allclose(collapsed, expected, rtol=0.0, atol=tolerance * expected.max())
 
 
 def test_pupil_depends_on_wavelength():
