@@ -11,8 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
-import zarr
 
 import foveasim as fs
 from foveasim.errors import FileError, ParameterError
@@ -106,6 +104,8 @@ def test_dataset_attributes_name_settings_seed_versions(capture):
 
 @pytest.mark.parametrize("file_format", ["nc", "zarr"])
 def test_dataset_survives_netcdf_and_zarr(capture, tmp_path, file_format):
+    import xarray as xr
+
     expected = capture.to_xarray()
     if file_format == "nc":
         expected = expected.drop_vars(["raw", "flag"])  # netCDF 4 has neither bytes nor booleans
@@ -163,6 +163,8 @@ def test_store_round_trip_is_bit_identical(capture, tmp_path):
 
 
 def test_xarray_opens_store_as_dataset(capture, tmp_path):
+    import xarray as xr
+
     capture.save(tmp_path / "x.zarr")
     expected = capture.to_xarray()
     with xr.open_zarr(tmp_path / "x.zarr", consolidated=False, chunks=None) as found:
@@ -172,6 +174,8 @@ def test_xarray_opens_store_as_dataset(capture, tmp_path):
 
 
 def test_store_replaces_captures_only(capture, tmp_path):
+    import zarr
+
     other = make_capture()
     other.save(tmp_path / "x.zarr")
     capture.save(tmp_path / "x.zarr")

@@ -8,15 +8,12 @@ import re
 import runpy
 import sys
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-import matplotlib as mpl
 import pytest
-from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from PIL import Image
-from skimage.data import astronaut
 
 from foveasim._core.registry import Registry
 from foveasim.sensor import Sensor
@@ -35,10 +32,16 @@ def pages_of(root):
     return [page for page in sorted(docs.rglob("*.md")) if page.relative_to(docs).parts[0] not in GENERATED]
 
 
+@cache
+def names_of(script):
+    """Return the names of a script in the documentation."""
+    return runpy.run_path(str(ROOT / "docs" / script))
+
+
 def broken_links(root):
     """Yield page and target of links to neither files of the repository nor generated pages."""
     docs = root.resolve() / "docs"
-    generated = runpy.run_path(str(ROOT / "docs" / "generated_pages.py"))["generated_pages"](root)
+    generated = names_of("generated_pages.py")["generated_pages"](root)
     top = [root / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md") if (root / name).exists()]
     for page in [*top, *pages_of(root)]:
         for target in TARGET.findall(page.read_text()):
@@ -91,6 +94,9 @@ def _registries_stay():
 @pytest.mark.usefixtures("_registries_stay")
 @pytest.mark.parametrize("page", [pytest.param(page, marks=NEEDS.get(page.stem, []), id=page.stem) for page in PAGES])
 def test_code_on_a_page_runs(page, tmp_path, monkeypatch):
+    import matplotlib as mpl
+    from skimage.data import astronaut
+
     mpl.use("agg")
     monkeypatch.chdir(tmp_path)
     Image.fromarray(astronaut()).save("photo.jpg")
@@ -176,47 +182,56 @@ def test_broken_link_is_reported(tmp_path, link):
     assert list(broken_links(tmp_path / "gallery")) == [("docs/guides/a.md", link)]
 
 
-GENERATORS = runpy.run_path(str(ROOT / "docs" / "generated_pages.py"))
-DARK = runpy.run_path(str(ROOT / "docs" / "dark_figures.py"))
+@pytest.fixture
+def generators():
+    return names_of("generated_pages.py")
 
 
-def test_chapters_of_gallery_contain_each_script_once():
-    numbers = sorted(number for numbers in GENERATORS["CHAPTERS"].values() for number in numbers)
+@pytest.fixture
+def dark():
+    return names_of("dark_figures.py")
 
-    assert numbers == [int(script.name[:2]) for script in GENERATORS["gallery_scripts"](ROOT)]
+
+def test_chapters_of_gallery_contain_each_script_once(generators):
+    numbers = sorted(number for numbers in generators["CHAPTERS"].values() for number in numbers)
+
+    assert numbers == [int(script.name[:2]) for script in generators["gallery_scripts"](ROOT)]
 
 
-def test_registries_are_described_by_their_entries():
-    tables = GENERATORS["tables_of"]("foveasim.layout", ["LAYOUTS", "RULES", "grid"])
-    lines = {name: GENERATORS["entry_of"](next(iter(table.values()))) for name, table in tables.items()}
+def test_registries_are_described_by_their_entries(generators):
+    tables = generators["tables_of"]("foveasim.layout", ["LAYOUTS", "RULES", "grid"])
+    lines = {name: generators["entry_of"](next(iter(table.values()))) for name, table in tables.items()}
 
     assert set(tables) == {"LAYOUTS", "RULES"}
     assert all(len(line) > 20 and "\n" not in line for line in lines.values())
-    assert GENERATORS["comment_on"]("LAYOUTS", "foveasim.layout").startswith("Layout generators by their name")
+    assert generators["comment_on"]("LAYOUTS", "foveasim.layout").startswith("Layout generators by their name")
 
 
-def test_functions_of_layout_are_in_groups():
-    names = GENERATORS["public_names"]()["foveasim.layout"]
-    groups = dict(GENERATORS["sections_of"]("foveasim.layout", names))
+def test_functions_of_layout_are_in_groups(generators):
+    names = generators["public_names"]()["foveasim.layout"]
+    groups = dict(generators["sections_of"]("foveasim.layout", names))
 
     assert sorted(name for group in groups.values() for name in group) == sorted(names)
     assert {"grid", "log_polar"} <= set(groups["Generators"])
     assert {"clip", "mosaic"} <= set(groups["Edits"])
 
 
-def test_dark_variant_inverts_greys_and_is_reverted():
+def test_dark_variant_inverts_greys_and_is_reverted(dark):
+    from matplotlib.colors import to_rgb
+    from matplotlib.figure import Figure
+
     figure = Figure()
     axes = figure.add_subplot()
     (black, red) = (axes.plot([0, 1], color=colour)[0] for colour in ("black", "red"))
     text = axes.annotate("a", (0, 0), (0.5, 0.5), bbox={"facecolor": "white"}, arrowprops={"arrowstyle": "->"})
     image = axes.imshow([[0.0, 1.0]], cmap="gray")
-    restore = DARK["invert_greys"](figure)
+    restore = dark["invert_greys"](figure)
 
     assert [to_rgb(colour) for colour in (black.get_color(), text.get_color(), axes.xaxis.label.get_color())] == [
-        (DARK["BLACK"],) * 3
+        (dark["BLACK"],) * 3
     ] * 3
     for patch in (figure.patch, axes.patch, text.get_bbox_patch()):
-        assert to_rgb(patch.get_facecolor()) == pytest.approx((DARK["WHITE"],) * 3)
+        assert to_rgb(patch.get_facecolor()) == pytest.approx((dark["WHITE"],) * 3)
     assert red.get_color() == "red"
     assert image.get_cmap().name == "gray"
 
@@ -226,26 +241,31 @@ def test_dark_variant_inverts_greys_and_is_reverted():
     assert to_rgb(figure.patch.get_facecolor()) == (1.0, 1.0, 1.0)
 
 
-def test_markers_have_inverted_greys():
+def test_markers_have_inverted_greys(dark):
+    from matplotlib.colors import to_rgb
+    from matplotlib.figure import Figure
+
     figure = Figure()
     (points,) = figure.add_subplot().plot([0, 1], "ko")
-    DARK["invert_greys"](figure)
+    dark["invert_greys"](figure)
 
-    assert to_rgb(points.get_markerfacecolor()) == to_rgb(points.get_markeredgecolor()) == (DARK["BLACK"],) * 3
+    assert to_rgb(points.get_markerfacecolor()) == to_rgb(points.get_markeredgecolor()) == (dark["BLACK"],) * 3
 
 
-def test_greys_of_dark_figures_remain():
+def test_greys_of_dark_figures_remain(dark):
+    from matplotlib.figure import Figure
+
     figure = Figure(facecolor="#101418")
     title = figure.suptitle("a", color="white")
 
-    assert DARK["invert_greys"](figure) == []
+    assert dark["invert_greys"](figure) == []
     assert title.get_color() == "white"
 
 
 @pytest.mark.parametrize("size", [(300, 100), (100, 300), (640, 480)])
-def test_thumbnails_have_one_shape(tmp_path, size):
+def test_thumbnails_have_one_shape(tmp_path, size, generators):
     Image.new("RGBA", size, (200, 0, 0, 128)).save(tmp_path / "picture.png")
-    GENERATORS["write_thumbnail"](tmp_path / "picture.png", tmp_path / "thumbnail.jpg")
+    generators["write_thumbnail"](tmp_path / "picture.png", tmp_path / "thumbnail.jpg")
 
     with Image.open(tmp_path / "thumbnail.jpg") as thumbnail:
         assert thumbnail.size == (480, 360)

@@ -68,21 +68,23 @@ def deep_list():
     return inner
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        deep_list(),
-        [1.0] * 10**6,
-        "x y " * 10**6,
-        b"z" * 10**6,
-        np.zeros((500, 500)),
-        10**5000,
-        {"k": "v" * 10**6},
-        {k: k for k in range(10**5)},
-    ],
-    ids=["deep", "list", "string", "bytes", "array", "integer", "value", "dict"],
-)
-def test_long_values_are_shortened_in_messages(value):
+#: Functions that return long values, which take a while.
+LONG_VALUES = {
+    "deep": deep_list,
+    "list": lambda: [1.0] * 10**6,
+    "string": lambda: "x y " * 10**6,
+    "bytes": lambda: b"z" * 10**6,
+    "array": lambda: np.zeros((500, 500)),
+    "integer": lambda: 10**5000,
+    "value": lambda: {"k": "v" * 10**6},
+    "dict": lambda: {k: k for k in range(10**5)},
+}
+
+
+@pytest.mark.parametrize("kind", LONG_VALUES)
+def test_long_values_are_shortened_in_messages(kind):
+    value = LONG_VALUES[kind]()
+
     assert len(format_value(value)) <= 80
     assert len(str(ParameterError("name", "must be short", value))) < 120
     for error in (FileError, ConfigError):

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from matplotlib.text import Text
 
 import foveasim
 import foveasim.view
@@ -31,6 +30,8 @@ DOTS_PER_INCH = 40.0
 @pytest.mark.slow(keep=("02_light", "25_own", "16_four"))
 @pytest.mark.parametrize("path", PARAMETERS)
 def test_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
+    from matplotlib.text import Text
+
     monkeypatch.chdir(tmp_path)
     small = []
     save = foveasim.view.save_figure

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import optuna
 import pytest
 
 from foveasim import explore
@@ -58,6 +57,8 @@ def perimeter(_shot, _camera, capture):
 
 
 def test_two_objectives_give_constrained_pareto_front():
+    from optuna.trial import TrialState
+
     found = explore.study(
         SHOT,
         {
@@ -70,7 +71,7 @@ def test_two_objectives_give_constrained_pareto_front():
         metrics=["n_sites", perimeter],
         n_trials=40,
     )
-    trials = found.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
+    trials = found.get_trials(states=(TrialState.COMPLETE,))
     allowed = [t for t in trials if t.values[0] <= 80]
 
     def is_dominated(one):
@@ -114,6 +115,13 @@ def test_search_values_have_setting_type():
 
 
 SEARCH = {"exposure_s": (1e-5, 1e-3), "optics.emission": ["lambertian", "isotropic"]}
+
+
+def stored(path):
+    """Return the study in a file."""
+    import optuna
+
+    return optuna.load_study(study_name="study", storage=f"sqlite:///{path}")
 
 
 def outcomes(study):
@@ -205,7 +213,7 @@ def test_study_file_is_locked(tmp_path):
     run(tmp_path / "s.db", run_second_program)
 
     assert [path.name for path in tmp_path.iterdir()] == ["s.db"]
-    found = optuna.load_study(study_name="study", storage=f"sqlite:///{tmp_path}/s.db")
+    found = stored(tmp_path / "s.db")
     assert [trial.value for trial in found.trials] == [1.0] * 3
 
 
@@ -216,14 +224,14 @@ def test_writer_stops_when_replaced(tmp_path):
     def replace_writer(*_):
         calls.append(1)
         if len(calls) == 3:
-            optuna.load_study(study_name="study", storage=f"sqlite:///{tmp_path}/s.db").set_user_attr("writer", "other")
+            stored(tmp_path / "s.db").set_user_attr("writer", "other")
         return 1.0
 
     metrics = {"m": replace_writer}
     with pytest.raises(FileError, match="is being written by another program, which runs the same study"):
         explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=9, metrics=metrics, storage=tmp_path / "s.db")
 
-    found = optuna.load_study(study_name="study", storage=f"sqlite:///{tmp_path}/s.db")
+    found = stored(tmp_path / "s.db")
     assert [trial.value for trial in explore.finished_trials(found)] == [1.0] * 2
     assert len(found.trials) == 3
     assert all(trial.state.is_finished() for trial in found.trials)
@@ -292,7 +300,7 @@ def mixed_study(tmp_path_factory):
     storage = tmp_path_factory.mktemp("study") / "s.db"
     options = {"n_trials": 12, "metrics": ["snr", "n_sites"], "storage": storage, "seed": 4}
     explore.study(SHOT, MIXED_CHOICES, {"snr_mean": "maximize"}, **options)
-    return optuna.load_study(storage=f"sqlite:///{storage}", study_name="study")
+    return stored(storage)
 
 
 def test_finished_trials_contain_typed_choices(mixed_study):

@@ -13,10 +13,10 @@ import threading
 import time
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
+from functools import cache
 
 import numpy as np
 import pytest
-import xarray as xr
 from waiting import DEADLINE_S, has_ended, wait_until
 
 from foveasim import cli, explore
@@ -52,6 +52,13 @@ REPEATS = 5
 SLOW_S = 0.02
 #: Time limit of a sweep on a slow machine, seconds.
 LIMIT_S = 2.0 * DEADLINE_S
+
+
+def xr():
+    """Return the library, which takes a second to import."""
+    import xarray
+
+    return xarray
 
 
 def in_process(plan):
@@ -149,7 +156,7 @@ def dtypes(data):
 
 def assert_identical(one, other):
     assert dtypes(one) == dtypes(other)
-    xr.testing.assert_identical(with_objects(one), with_objects(other))
+    xr().testing.assert_identical(with_objects(one), with_objects(other))
 
 
 # -- results on different workers -------------------------------------------------------------------------------------
@@ -638,38 +645,41 @@ def test_failed_points_can_be_retried_repeatedly(tmp_path, monkeypatch):
 
 # -- the journal and the store ----------------------------------------------------------------------------------------
 
-PLAN = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 10]})
+
+@cache
+def plan_3():
+    return explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 10]})
 
 
 def test_journal_ignores_truncated_lines_only(tmp_path):
     store = tmp_path / "r.zarr"
-    with Journal(store, PLAN.to_dict()) as journal:
+    with Journal(store, plan_3().to_dict()) as journal:
         for point in range(3):
             journal.add(Record(point, {"a": 0.1 + point, "curve": to_values("c", np.arange(3.0))["c"]}, "", "µ"))
     complete = journal_path(store).read_bytes()
     for n_cut in (1, 20, 60):
         journal_path(store).write_bytes(complete[:-n_cut])
-        with Journal(store, PLAN.to_dict()) as journal:
+        with Journal(store, plan_3().to_dict()) as journal:
             assert sorted(journal.records) == [0, 1]
             assert journal.records[1].values["a"] == 1.1
             np.testing.assert_array_equal(journal.records[1].values["curve"].data, np.arange(3.0))
     damaged = bytearray(complete)
     damaged[complete.index(b'"a": 1.1') + 5] ^= 1
     journal_path(store).write_bytes(damaged)
-    with Journal(store, PLAN.to_dict()) as journal:
+    with Journal(store, plan_3().to_dict()) as journal:
         assert sorted(journal.records) == [0, 2]
 
 
 def test_journal_with_truncated_header_is_restarted(tmp_path):
     store = tmp_path / "r.zarr"
-    with Journal(store, PLAN.to_dict()) as journal:
+    with Journal(store, plan_3().to_dict()) as journal:
         head = journal_path(store).read_bytes()
     for torn in (head[:40], head[:-1], b"\0" * 100, b""):
         journal_path(store).write_bytes(torn)
-        with Journal(store, PLAN.to_dict()) as journal:
+        with Journal(store, plan_3().to_dict()) as journal:
             assert journal.records == {}
             journal.add(Record(0, {"a": 1.0}))
-        with Journal(store, PLAN.to_dict()) as journal:
+        with Journal(store, plan_3().to_dict()) as journal:
             assert sorted(journal.records) == [0]
         journal_path(store).unlink()
 
@@ -682,25 +692,25 @@ def test_full_disk_leaves_valid_journal(tmp_path, monkeypatch):
         write(file, bytes(data)[:10])
         raise OSError(28, "No space left on device")
 
-    with Journal(store, PLAN.to_dict()) as journal:
+    with Journal(store, plan_3().to_dict()) as journal:
         journal.add(Record(0, {"a": 1.0}))
         monkeypatch.setattr(os, "write", full)
         with pytest.raises(FileError, match=r"No space left on device; it contains 1 points"):
             journal.add(Record(1, {"a": 2.0}))
     monkeypatch.undo()
-    with Journal(store, PLAN.to_dict()) as journal:
+    with Journal(store, plan_3().to_dict()) as journal:
         assert sorted(journal.records) == [0]
 
 
 def test_sweep_store_is_locked(tmp_path):
     store = tmp_path / "r.zarr"
-    with Journal(store, PLAN.to_dict()), pytest.raises(FileError, match="being written by another program"):
-        Journal(store, PLAN.to_dict())
+    with Journal(store, plan_3().to_dict()), pytest.raises(FileError, match="being written by another program"):
+        Journal(store, plan_3().to_dict())
 
 
 def test_store_of_other_sweep_is_unchanged(tmp_path):
     store = tmp_path / "r.zarr"
-    write_store(to_dataset(PLAN, {}), store)
+    write_store(to_dataset(plan_3(), {}), store)
     other = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 12]})
 
     with pytest.raises(FileError, match=r"belongs to another sweep or study: 'vary\.sensor\.bits' differs"):
@@ -728,7 +738,7 @@ def test_invalid_journal_file_is_unchanged(tmp_path, text):
     journal_path(tmp_path / "r.zarr").write_text(text)
 
     with pytest.raises(FileError, match="is not a sweep journal"):
-        explore.run_sweep(PLAN, out=tmp_path / "r.zarr")
+        explore.run_sweep(plan_3(), out=tmp_path / "r.zarr")
     assert journal_path(tmp_path / "r.zarr").read_text() == text
 
 
@@ -740,13 +750,13 @@ def test_xarray_opens_store_without_warning(tmp_path):
     found = to_dataset(explore.plan_sweep(SHOT, {"sensor.bits": [8, 9]}), records)
     write_store(found, tmp_path / "r.zarr")  # warnings are errors here, too
 
-    with xr.open_zarr(tmp_path / "r.zarr") as opened:
+    with xr().open_zarr(tmp_path / "r.zarr") as opened:
         assert_identical(opened.load(), found)
 
 
 def test_arrays_are_aligned_or_padded():
-    one = xr.DataArray([1.0, 2.0], dims="colour", coords={"colour": ["red", "green"]})
-    two = xr.DataArray([3.0, 4.0], dims="colour", coords={"colour": ["green", "blue"]})
+    one = xr().DataArray([1.0, 2.0], dims="colour", coords={"colour": ["red", "green"]})
+    two = xr().DataArray([3.0, 4.0], dims="colour", coords={"colour": ["green", "blue"]})
     records = {
         k: Record(
             k, to_values("c", array) | to_values("m", {"n": k, "path": "ab"[k]}) | to_values("v", np.arange(k + 1))
@@ -765,8 +775,8 @@ def test_arrays_are_aligned_or_padded():
 
 UNUSUAL = {
     "0-d array": lambda _: np.array(3.0),
-    "0-d DataArray": lambda k: xr.DataArray(np.arange(k + 2.0)).mean(),
-    "Dataset": lambda k: xr.Dataset({"a": 3.0, "b": ("x", np.arange(k + 2.0))}),
+    "0-d DataArray": lambda k: xr().DataArray(np.arange(k + 2.0)).mean(),
+    "Dataset": lambda k: xr().Dataset({"a": 3.0, "b": ("x", np.arange(k + 2.0))}),
     "longdouble array": lambda _: np.arange(3, dtype=np.longdouble),
     "longdouble scalar": lambda _: np.longdouble(3.0),
     "big-endian": lambda _: np.arange(3, dtype=">i4"),
@@ -775,15 +785,19 @@ UNUSUAL = {
     "empty array": lambda _: np.array([]),
     "object array of strings": lambda _: np.array(["a", "bc"], object),
     "number and string": lambda k: "seven" if k else 7,
-    "labels of mixed types": lambda k: xr.DataArray([1.0, 2.0], dims="x", coords={"x": ["1", "b"] if k else [1, 2]}),
-    "large labels": lambda k: xr.DataArray([1.0], dims="x", coords={"x": np.array([2**63], np.uint64) if k else [-1]}),
-    "dimension repeat": lambda _: xr.DataArray([1.0, 2.0], dims="repeat", coords={"repeat": [5, 6]}),
-    "dimension with metric name": lambda _: xr.DataArray([1.0, 2.0], dims="odd", coords={"odd": [5, 6]}),
-    "dimension with setting name": lambda _: xr.DataArray([1.0, 2.0], dims="exposure_s", coords={"exposure_s": [5, 6]}),
-    "dimension with result name": lambda _: {"0": 1.0, "a": xr.DataArray([1.0, 2.0], dims="odd_0")},
+    "labels of mixed types": lambda k: xr().DataArray([1.0, 2.0], dims="x", coords={"x": ["1", "b"] if k else [1, 2]}),
+    "large labels": lambda k: xr().DataArray(
+        [1.0], dims="x", coords={"x": np.array([2**63], np.uint64) if k else [-1]}
+    ),
+    "dimension repeat": lambda _: xr().DataArray([1.0, 2.0], dims="repeat", coords={"repeat": [5, 6]}),
+    "dimension with metric name": lambda _: xr().DataArray([1.0, 2.0], dims="odd", coords={"odd": [5, 6]}),
+    "dimension with setting name": lambda _: xr().DataArray(
+        [1.0, 2.0], dims="exposure_s", coords={"exposure_s": [5, 6]}
+    ),
+    "dimension with result name": lambda _: {"0": 1.0, "a": xr().DataArray([1.0, 2.0], dims="odd_0")},
     "partly labelled dimension": lambda _: {
-        "a": xr.DataArray([1.0], dims="x", coords={"x": [5]}),
-        "b": xr.DataArray([1.0, 2.0], dims="x"),
+        "a": xr().DataArray([1.0], dims="x", coords={"x": [5]}),
+        "b": xr().DataArray([1.0, 2.0], dims="x"),
     },
 }
 
@@ -823,24 +837,27 @@ def test_unusual_results_are_stored_and_read(kind, tmp_path):
         (np.array(["2020-01-01"], "datetime64[D]"), "must return numbers or strings"),
         ("\ud800", "must return valid Unicode strings"),
         (np.array(["a", "\ud800"]), "must return valid Unicode strings"),
-        (xr.DataArray([1.0, 2.0], dims="x", coords={"x": [1.0, np.nan]}), "unique labels along 'x', without NaN"),
-        (xr.DataArray([1.0, 2.0, 3.0], dims="x", coords={"x": [0.5, 0.5, 1]}), "unique labels along 'x'"),
+        (
+            lambda: xr().DataArray([1.0, 2.0], dims="x", coords={"x": [1.0, np.nan]}),
+            "unique labels along 'x', without NaN",
+        ),
+        (lambda: xr().DataArray([1.0, 2.0, 3.0], dims="x", coords={"x": [0.5, 0.5, 1]}), "unique labels along 'x'"),
         ({"a/b": 1}, "'m_a/b' must be a short printable string without '/', as the name of a result"),
         ({"a" * 300: 1}, "as the name of a result"),
         ({"\ud800": 1}, "as the name of a result"),
-        (xr.DataArray([1.0], dims="a/b", coords={"a/b": [1]}), "as the name of a result"),
+        (lambda: xr().DataArray([1.0], dims="a/b", coords={"a/b": [1]}), "as the name of a result"),
         ({"a": {"b": 1}, "a_b": 99}, "'m_a_b' must be a unique result name, got two results"),
         (None, "must return a number, a string, a mapping, an array or a labelled array, got a NoneType"),
     ],
 )
 def test_unsupported_results_are_rejected(given, message):
     with pytest.raises(ParameterError, match=message):
-        to_values("m", given)
+        to_values("m", given() if callable(given) else given)
 
 
 def test_results_with_differing_dimensions_are_reported():
     plan = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 10, 11]})
-    given = [3.0, np.arange(2.0), 4.0, xr.DataArray([1.0], dims="x", coords={"x": [1]})]
+    given = [3.0, np.arange(2.0), 4.0, xr().DataArray([1.0], dims="x", coords={"x": [1]})]
     records = {k: Record(k, to_values("m", one), "failed" if k == 3 else "") for k, one in enumerate(given)}
 
     found = to_dataset(plan, records)
@@ -1098,7 +1115,7 @@ def test_unwritable_store_is_rejected_before_start(tmp_path, store):
     (tmp_path / "directory").mkdir()
 
     with pytest.raises(FileError, match="cannot be written"):
-        explore.run_sweep(PLAN, out=tmp_path / store)
+        explore.run_sweep(plan_3(), out=tmp_path / store)
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "tcp://", "foo://host:1", "silent"])
@@ -1110,7 +1127,7 @@ def test_unreachable_scheduler_is_rejected_before_start(tmp_path, monkeypatch, a
         with pytest.raises(
             ParameterError, match="'scheduler' must be the address of a dask scheduler that answers within"
         ):
-            explore.run_sweep(PLAN, out=tmp_path / "r.zarr", scheduler=address)
+            explore.run_sweep(plan_3(), out=tmp_path / "r.zarr", scheduler=address)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -1123,7 +1140,7 @@ def test_other_servers_are_rejected_as_scheduler():
 
         threading.Thread(target=answer, daemon=True).start()
         with pytest.raises(ParameterError, match=r"within 10 s \(it is not a dask scheduler\)"):
-            explore.run_sweep(PLAN, scheduler=f"tcp://127.0.0.1:{server.getsockname()[1]}")
+            explore.run_sweep(plan_3(), scheduler=f"tcp://127.0.0.1:{server.getsockname()[1]}")
 
 
 @pytest.mark.slow
