@@ -159,21 +159,25 @@ def test_names_outside_utf8_are_escaped(tmp_path):
     assert failed.stderr == rb"error: $caf\udce9$^.yamlx: no such file; did you mean '$caf\udce9$^.yaml'?" + b"\n"
 
 
-#: Commands with their exit codes, and what they print on an ASCII-only terminal.
-ON_ASCII = [
-    (("layouts",), 0, b"field / um"),
-    (("describe", "four_zones"), 0, b"mm2"),
-    (("check", "rings.yaml"), 1, b"fail"),
-    (("convert", "rings.yaml", "rings.svg"), 0, b"moved by at most 6.4e-05 um"),
-    (("run", "shot.yaml", "-o", "out"), 0, b"smallest site / um"),
-    (("video", "picture.yaml", "--frames", "frames", "-o", "seen.gif"), 0, b"2 frames"),
-    (("view", "shot.yaml", "--out", "page.html"), 2, b"error: shot.yaml"),
-    (("describe", "\u00e9\u00b5.yaml"), 2, b"error: "),
-    (("--help",), 0, b"Usage"),
-    (("run", "--help"), 0, b"Usage"),
-    (("run", "--bad"), 2, b"Usage"),
-    (("schema",), 0, b"title"),
-]
+#: Commands with their exit codes, and what they print on an ASCII-only terminal; those that compute, and the others.
+ON_ASCII = {
+    "texts": [
+        (("layouts",), 0, b"field / um"),
+        (("check", "rings.yaml"), 1, b"fail"),
+        (("convert", "rings.yaml", "rings.svg"), 0, b"moved by at most 6.4e-05 um"),
+        (("view", "shot.yaml", "--out", "page.html"), 2, b"error: shot.yaml"),
+        (("describe", "\u00e9\u00b5.yaml"), 2, b"error: "),
+        (("--help",), 0, b"Usage"),
+        (("run", "--help"), 0, b"Usage"),
+        (("run", "--bad"), 2, b"Usage"),
+        (("schema",), 0, b"title"),
+    ],
+    "results": [
+        (("describe", "four_zones"), 0, b"mm2"),
+        (("run", "shot.yaml", "-o", "out"), 0, b"smallest site / um"),
+        (("video", "picture.yaml", "--frames", "frames", "-o", "seen.gif"), 0, b"2 frames"),
+    ],
+}
 #: The list of all bundled layouts takes seconds.
 FEW_LAYOUTS = """
 from foveasim import config
@@ -183,7 +187,9 @@ config.bundled_layouts = lambda: few
 """
 
 
-def test_ascii_terminals_get_plain_characters(tmp_path):
+@pytest.mark.slow(keep=("texts",))
+@pytest.mark.parametrize("kind", ON_ASCII)
+def test_ascii_terminals_get_plain_characters(tmp_path, kind):
     rings = {"generator": "log_polar", "parameters": {"n_sectors": 16, "r_min_um": 2.0, "r_max_um": 20.0}}
     (tmp_path / "rings.yaml").write_text(yaml.safe_dump({**rings, "rules": {"min_size_um": 1.0}}))
     (tmp_path / "shot.yaml").write_text(yaml.safe_dump(SHOT))
@@ -198,10 +204,10 @@ def test_ascii_terminals_get_plain_characters(tmp_path):
     (tmp_path / "frames").mkdir()
     for k in range(2):
         Image.new("RGB", (60, 60), (90 * k, 9, 9)).save(tmp_path / "frames" / f"{k}.png")
-    commands = [arguments for arguments, _, _ in ON_ASCII]
+    commands = [arguments for arguments, _, _ in ON_ASCII[kind]]
     results = run_programs(*commands, cwd=tmp_path, before=FEW_LAYOUTS, COLUMNS="200", **ASCII)
 
-    for (arguments, code, printed), result in zip(ON_ASCII, results, strict=True):
+    for (arguments, code, printed), result in zip(ON_ASCII[kind], results, strict=True):
         assert is_clean(result), (arguments, result.stderr)
         assert result.returncode == code, (arguments, result.stderr)
         assert printed in result.stdout + result.stderr, arguments
