@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
-from scipy.special import erf, gammaln, rel_entr
-from scipy.stats import norm
+from scipy.special import erf, gammaln, ndtri, rel_entr
 
 import foveasim as fs
 from foveasim.compare import SceneCovariance, gaussian_information_bits, scene_covariance, site_information_bits
@@ -20,7 +19,7 @@ def random_covariance(n, seed=0):
 
 
 def test_poisson_site_matches_exact_information():
-    mean_e = norm.ppf((np.arange(4000) + 0.5) / 4000, 50.0, 15.0)
+    mean_e = 50.0 + 15.0 * ndtri((np.arange(4000) + 0.5) / 4000)
     mean_e = mean_e[mean_e > 0.5]
     counts = np.arange(0, 400)
     probability = np.exp(counts * np.log(mean_e[:, np.newaxis]) - mean_e[:, np.newaxis] - gammaln(counts + 1.0))
@@ -141,8 +140,10 @@ def covariance_of_squares(layout, side_um, covariance):
 
 
 @pytest.mark.slow(keep=6)
-@pytest.mark.parametrize("snr", [10.0, 1000.0])
-@pytest.mark.parametrize("side_um", [1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
+@pytest.mark.parametrize(
+    ("side_um", "snr"),
+    [(1.0, 10.0), (2.0, 1000.0), (4.0, 10.0), (8.0, 1000.0), (16.0, 10.0), (32.0, 1000.0), (1.0, 1000.0)],
+)
 @pytest.mark.parametrize("sigma_um", [(3.0,), (1.5, 6.0, 24.0)])
 def test_information_of_squares_matches_closed_form(sigma_um, side_um, snr):
     layout = fs.layout.grid(20, 20, side_um)

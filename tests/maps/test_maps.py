@@ -15,8 +15,7 @@ import zlib
 import numpy as np
 import pytest
 import scipy.constants
-import scipy.io
-import tifffile
+from lazy_modules import LazyModule
 
 import foveasim as fs
 from foveasim import maps
@@ -28,12 +27,9 @@ from foveasim.maps import _dataset, from_xarray, read_power_map, to_xarray, writ
 from foveasim.maps._formats import MAP_FORMATS, read_found
 from foveasim.maps._units import irradiance_unit
 
-h5py = pytest.importorskip("h5py")
-xr = pytest.importorskip("xarray")
-zarr = pytest.importorskip("zarr")
-fits = pytest.importorskip("astropy.io.fits")
-OpenEXR = pytest.importorskip("OpenEXR")
-pytest.importorskip("h5netcdf")
+h5py, xr, zarr, fits, OpenEXR, tifffile = map(
+    LazyModule, ("h5py", "xarray", "zarr", "astropy.io.fits", "OpenEXR", "tifffile")
+)
 
 EXTENSIONS = ("npz", "fits", "tif", "exr", "nc", "zarr")
 #: Letter without symmetry, top row first and bottom row first.
@@ -980,12 +976,36 @@ def npy_header(shape, dtype="<f4"):
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
 
 
+def compressed_zeros(n_mib):
+    """Return a zlib stream of zeros: compressed blocks of 1 MiB that do not refer to each other are repeated."""
+    compressor, block = zlib.compressobj(9), bytes(2**20)
+    first = compressor.compress(block) + compressor.flush(zlib.Z_FULL_FLUSH)
+    other = compressor.compress(block) + compressor.flush(zlib.Z_FULL_FLUSH)
+    end = zlib.compressobj(9, wbits=-15).flush()
+    # Adler-32 of n zeros: sums of 1 and n.
+    checksum = ((n_mib * 2**20) % 65_521) << 16 | 1
+    return first + other * (n_mib - 1) + end + struct.pack(">I", checksum)
+
+
 def zipped(**members):
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members.items():
             archive.writestr(f"{name}.npy", content)
     return file.getvalue()
+
+
+def zip_bomb():
+    """Return an archive with an array of 512 MiB."""
+    header, zeros, name = npy_header((2**14, 2**13)), bytes(2**29), b"data.npy"
+    compressor = zlib.compressobj(9, wbits=-15)
+    content = compressor.compress(header) + compressor.flush(zlib.Z_FULL_FLUSH) + compressed_zeros(2**9)[2:-4]
+    checksum = zlib.crc32(zeros, zlib.crc32(header))
+    sizes = len(content), len(header) + len(zeros), len(name)
+    about = struct.pack("<HHHHHIIIHH", 20, 0, zipfile.ZIP_DEFLATED, 0, 0, checksum, *sizes, 0)
+    member = b"PK\x03\x04" + about + name + content
+    directory = b"PK\x01\x02" + struct.pack("<H", 20) + about + struct.pack("<HHHII", 0, 0, 0, 0, 0) + name
+    return member + directory + b"PK\x05\x06" + struct.pack("<HHHHIIH", 0, 0, 1, 1, len(directory), len(member), 0)
 
 
 def fits_header(*cards, body=b""):
@@ -1046,9 +1066,9 @@ def sparse(tree):
 
 
 def hdf5_bomb(tree):
-    tree.create_dataset(
-        "light", data=np.zeros((2**13, 2**14), "f4"), chunks=(2**13, 2**14), compression="gzip", shuffle=True
-    )
+    shape = (2**13, 2**14)
+    light = tree.create_dataset("light", shape, "f4", chunks=shape, compression="gzip", shuffle=True)
+    light.id.write_direct_chunk((0, 0), compressed_zeros(2**9))
 
 
 def virtual(tree):
@@ -1076,7 +1096,7 @@ MALFORMED = {
         b"\x93NUMPY\x01\x00\x40\x00" + b"__import__('os').system('touch /tmp/owned')".ljust(63) + b"\n"
     ),
     "npy with an endless header": lambda: b"\x93NUMPY\x02\x00\xff\xff\xff\x7f" + b"(" * 100_000,
-    "zip bomb": lambda: zipped(data=npy_header((2**14, 2**13)) + bytes(2**29)),
+    "zip bomb": zip_bomb,
     "zip with a bomb as metadata": lambda: zipped(
         data=npy_header((2, 2)) + bytes(16), unit=npy_header((2**22,)) + bytes(2**24)
     ),
@@ -1112,7 +1132,7 @@ MALFORMED = {
     ),
     "hdf5 of 2000 arrays": lambda: hdf5(lambda t: [t.create_dataset(f"a{i}", data=1.0) for i in range(2000)]),
     "netCDF 3 of endless dimensions": lambda: b"CDF\x01" + struct.pack(">iii", 0, 10, 2**31 - 1) + bytes(100),
-    "mat bomb": lambda: mat(mat_element(15, zlib.compress(bytes(2**29), 9))),
+    "mat bomb": lambda: mat(mat_element(15, compressed_zeros(2**9))),
     "mat of a huge shape": lambda: mat(mat_array(b"oi", 6, (2**15, 2**16), mat_element(9, bytes(8)))),
     "mat of a huge cell": lambda: mat(mat_array(b"oi", 1, (2**15, 2**15))),
     "mat of nested cells": lambda: nested_mat(20_000),

@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
+import scipy
 
 import foveasim as fs
 from foveasim.errors import ParameterError, SamplingWarning
@@ -129,7 +129,7 @@ def hopkins(s, waves):
     """OTF of a defocused circle: overlap of two shifted discs with the phase difference of the parabola."""
     if s >= 1.0:
         return 0.0
-    value, _ = quad(
+    value, _ = scipy.integrate.quad(
         lambda x: 2 * np.sqrt(max(0.0, 1 - (abs(x) + s) ** 2)) * np.cos(8 * np.pi * waves * x * s), -(1 - s), 1 - s,
         limit=400, epsabs=1e-10,
     )  # fmt: skip

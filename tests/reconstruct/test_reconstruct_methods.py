@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import scipy
 import shapely
-import skimage.data
+import skimage
 from PIL import Image, features
 from reference.neighbours import sibson_weights
-from scipy.spatial import Delaunay
-from skimage.color import rgb2gray
-from skimage.transform import resize
 
 import foveasim as fs
 from foveasim._io.images import read_picture
@@ -173,7 +170,7 @@ def test_points_are_in_their_triangles(kind):
         "ring": 0.5 * np.stack((np.cos(angle), np.sin(angle)), axis=1),
         "almost collinear": np.stack((np.linspace(-0.5, 0.5, 40), 1e-9 * rng.uniform(-0.5, 0.5, 40)), axis=1),
     }[kind]
-    mesh = Delaunay(xy)
+    mesh = scipy.spatial.Delaunay(xy)
     corners, neighbours = (np.ascontiguousarray(part, np.int64) for part in (mesh.simplices, mesh.neighbors))
     # Any points, the sites, and points on edges.
     points = np.concatenate((rng.uniform(-0.6, 0.6, (500, 2)), xy, xy[corners[:, :2]].mean(axis=1)))
@@ -449,7 +446,8 @@ def test_nonconvergence_raises_simulation_error():
 )
 def test_least_squares_has_higher_psnr_than_cells(layout, name):
     grid = fs.Grid.centred((128, 128), 2.0)
-    light = 1.0 + 99.0 * resize(rgb2gray(getattr(skimage.data, name)()), (128, 128), anti_aliasing=True)[::-1] ** 2.2
+    grey = skimage.color.rgb2gray(getattr(skimage.data, name)())
+    light = 1.0 + 99.0 * skimage.transform.resize(grey, (128, 128), anti_aliasing=True)[::-1] ** 2.2
     values = np.random.default_rng(1).poisson(Integrator(layout, grid)(light)).astype(float)
     sharp = least_squares(layout, values, grid, variance=values + 1.0)
     blocky = cells(layout, values / layout.area_um2, grid)
@@ -840,6 +838,8 @@ def test_srgb_file_decodes_to_linear_values(tmp_path):
 
 @pytest.mark.parametrize("n_channels", [1, 3])
 def test_other_libraries_see_the_pixels(tmp_path, n_channels):
+    import matplotlib.pyplot as plt
+
     picture = partly_covered(n_channels)
     picture.save(tmp_path / "p.png")
     stored = np.asarray(Image.open(tmp_path / "p.png").convert("RGBA"))

@@ -9,8 +9,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-import skimage.color
-import tifffile
+import skimage
+from lazy_modules import LazyModule
 from PIL import Image
 
 import foveasim as fs
@@ -18,6 +18,7 @@ from foveasim._io.encodings import decode
 from foveasim.errors import FileError, ParameterError
 from foveasim.scene import Scene, charts
 
+tifffile = LazyModule("tifffile")
 EPS32 = float(np.finfo(np.float32).eps)
 
 #: Letter without symmetry, top row first, as in a file.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
-import scipy.ndimage
-import scipy.special
+import scipy
 import shapely
 
 import foveasim as fs
@@ -25,15 +25,22 @@ FRAME = fs.Layout.from_polygons(
 )
 IS_PRESENT = np.random.default_rng(5).random(HEXAGONS.n_sites) < 0.7
 LAYOUTS = {
-    "grid": grid(n_x=7, n_y=5, pitch_um=3.0),
-    "rectangles": grid(n_x=7, n_y=5, pitch_um=3.0, pitch_y_um=5.0),
-    "hexagons": HEXAGONS,
-    "hexagons with gaps": HEXAGONS[IS_PRESENT],
-    "rings": fs.layout.log_polar(n_sectors=16, r_min_um=6.0, r_max_um=44.0),
-    "zones": fs.layout.zones(side_um=(8, 24, 56), pitch_um=(2, 4, 8)),
-    "voronoi": fs.layout.voronoi(n_sites=200, size_um=(60.0, 40.0), seed=3),
-    "a site in a hole": FRAME,
+    "grid": lambda: grid(n_x=7, n_y=5, pitch_um=3.0),
+    "rectangles": lambda: grid(n_x=7, n_y=5, pitch_um=3.0, pitch_y_um=5.0),
+    "hexagons": lambda: HEXAGONS,
+    "hexagons with gaps": lambda: HEXAGONS[IS_PRESENT],
+    "rings": lambda: fs.layout.log_polar(n_sectors=16, r_min_um=6.0, r_max_um=44.0),
+    "zones": lambda: fs.layout.zones(side_um=(8, 24, 56), pitch_um=(2, 4, 8)),
+    "voronoi": lambda: fs.layout.voronoi(n_sites=200, size_um=(60.0, 40.0), seed=3),
+    "a site in a hole": lambda: FRAME,
 }
+
+
+@cache
+def layout_of(name):
+    return LAYOUTS[name]()
+
+
 #: Kernel without symmetry; all elements differ.
 KERNEL = np.array([[0.01, 0.02, 0.03], [0.04, 0.6, 0.05], [0.06, 0.07, 0.12]])
 WIDE = np.random.default_rng(8).random((5, 3)) / 20.0
@@ -53,7 +60,7 @@ def dense_matrix(operator):
 @pytest.mark.parametrize("spread_um", [0.0, 0.1, 1.0, 7.0])
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_diffusion_conserves_charge_and_is_non_negative(name, spread_um):
-    layout = LAYOUTS[name]
+    layout = layout_of(name)
     operator = Diffusion(spread_um=spread_um).compile(layout)
     charge_e = random_charge_e(layout)
 
@@ -65,7 +72,7 @@ def test_diffusion_conserves_charge_and_is_non_negative(name, spread_um):
 @pytest.mark.parametrize("spread_um", [0.1, 1.0, 7.0])
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_diffusion_preserves_uniform_irradiance(name, spread_um):
-    layout = LAYOUTS[name]
+    layout = layout_of(name)
     uniform_e = 70.0 * layout.area_um2
 
     np.testing.assert_allclose(Diffusion(spread_um=spread_um).compile(layout).apply(uniform_e), uniform_e, rtol=1e-10)
@@ -74,7 +81,7 @@ def test_diffusion_preserves_uniform_irradiance(name, spread_um):
 @pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("name", sorted(LAYOUTS.keys() - {"hexagons with gaps"}))
 def test_repeated_diffusion_equalises_charge_density(name):
-    layout = LAYOUTS[name]
+    layout = layout_of(name)
     charge_e = random_charge_e(layout)
     operator = Diffusion(spread_um=5.0).compile(layout)
     for _ in range(4000):
@@ -177,7 +184,7 @@ def test_short_spread_matches_monte_carlo_loss(name):
 
     Charge across corners is of relative order ``spread / edge``; the combination of two spreads isolates the linear term.
     """
-    layout = LAYOUTS[name]
+    layout = layout_of(name)
     site = int(np.argmin(np.hypot(*(layout.centroid_um - layout.centroid_um.mean(axis=0)).T)))
     polygon = layout.polygons()[site]
     shapely.prepare(polygon)
@@ -204,7 +211,9 @@ def test_short_spread_matches_monte_carlo_loss(name):
 
 def test_fraction_is_continuous_between_spread_regimes():
     spread_um = 0.125 * (1.0 + np.array([-1e-9, 1e-9]))
-    below, above = (dense_matrix(Diffusion(spread_um=s).compile(LAYOUTS["grid"].scale(1 / 3)))[0, 1] for s in spread_um)
+    below, above = (
+        dense_matrix(Diffusion(spread_um=s).compile(layout_of("grid").scale(1 / 3)))[0, 1] for s in spread_um
+    )
     assert math.isclose(below, above, rel_tol=1e-8)
 
 
@@ -232,7 +241,7 @@ def test_site_in_hole_exchanges_along_outline(spread_um):
 @pytest.mark.parametrize("fraction", [0.0, 0.02, 0.2, 0.5])
 def test_measured_neighbour_fraction_is_reproduced(fraction):
     diffusion = Diffusion.from_neighbour_fraction(fraction, pitch_um=3.0)
-    operator = diffusion.compile(LAYOUTS["grid"])
+    operator = diffusion.compile(layout_of("grid"))
     charge_e = np.zeros(35)
     charge_e[17] = 1.0
 
@@ -264,7 +273,7 @@ def test_max_gap_enables_exchange_across_trenches():
     ids=["short", "long", "coupling", "kernel"],
 )
 def test_crosstalk_is_independent_of_site_order(crosstalk):
-    layout = LAYOUTS["grid"]
+    layout = layout_of("grid")
     order = np.random.default_rng(4).permutation(layout.n_sites)
     charge_e = random_charge_e(layout)
 
@@ -397,11 +406,11 @@ def test_pitch_defines_grid_of_few_sites():
 def test_layouts_other_than_grids_are_rejected(name):
     layout = {
         **LAYOUTS,
-        "staggered": grid(n_x=5, n_y=4, pitch_um=2.0, stagger=True, fill_factor=0.3),
-        "rotated": LAYOUTS["grid"].rotate(20.0),
-        "slightly rotated": grid(n_x=50, n_y=50, pitch_um=2.0).rotate(2.0),
-        "duplicated": LAYOUTS["grid"][[0, 1, 2, 1]],
-    }[name]
+        "staggered": lambda: grid(n_x=5, n_y=4, pitch_um=2.0, stagger=True, fill_factor=0.3),
+        "rotated": lambda: layout_of("grid").rotate(20.0),
+        "slightly rotated": lambda: grid(n_x=50, n_y=50, pitch_um=2.0).rotate(2.0),
+        "duplicated": lambda: layout_of("grid")[[0, 1, 2, 1]],
+    }[name]()
     with pytest.raises(
         SimulationError, match=r"not a grid[^\n]*use Diffusion, which supports sites of any shape[^\n]*$"
     ):
@@ -466,7 +475,7 @@ def test_coupled_row_covariance_matches_closed_form():
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_coupling_is_symmetric_and_conserves_charge(name):
-    layout = LAYOUTS[name]
+    layout = layout_of(name)
     operator = InterPixelCapacitance(neighbour_fraction=0.01).compile(layout)
     charge_e = random_charge_e(layout)
 
@@ -477,13 +486,13 @@ def test_coupling_is_symmetric_and_conserves_charge(name):
 
 @pytest.mark.parametrize("name", ["grid", "hexagons"])
 def test_regular_tilings_have_stated_neighbour_fraction(name):
-    coupling = dense_matrix(InterPixelCapacitance(neighbour_fraction=0.01).compile(LAYOUTS[name]))
+    coupling = dense_matrix(InterPixelCapacitance(neighbour_fraction=0.01).compile(layout_of(name)))
     neighbours = coupling[coupling < 0.5]
     np.testing.assert_allclose(neighbours[neighbours > 0.0], 0.01, rtol=1e-9)
 
 
 def test_neighbour_fraction_scales_with_reference_edge():
-    coupling = dense_matrix(InterPixelCapacitance(neighbour_fraction=0.01, edge_um=6.0).compile(LAYOUTS["grid"]))
+    coupling = dense_matrix(InterPixelCapacitance(neighbour_fraction=0.01, edge_um=6.0).compile(layout_of("grid")))
     assert math.isclose(coupling[0, 1], 0.005, rel_tol=1e-9)
 
 
@@ -491,7 +500,7 @@ def test_neighbour_fraction_scales_with_reference_edge():
 @pytest.mark.parametrize("is_equal", [True, False])
 def test_weak_coupling_matches_capacitor_network(name, is_equal):
     """The reference solves the complete network; the difference is of second order in the coupling."""
-    layout = LAYOUTS[name]
+    layout = layout_of(name)
     node_f = np.random.default_rng(6).uniform(1.0, 1.0 if is_equal else 4.0, layout.n_sites) * 1e-15
     charge_e = random_charge_e(layout)
     edge_um = layout.adjacency().toarray()
@@ -607,7 +616,7 @@ def test_strong_coupling_error_names_site():
     with pytest.raises(
         ParameterError, match=r"'neighbour_fraction' must be smaller: site 8 would couple 0.8 of its charge"
     ):
-        InterPixelCapacitance(neighbour_fraction=0.2).compile(LAYOUTS["grid"])
+        InterPixelCapacitance(neighbour_fraction=0.2).compile(layout_of("grid"))
 
 
 @pytest.mark.parametrize("charge_e", [np.ones(5), 3.0, np.ones((72, 2)), "all"])

@@ -10,7 +10,6 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import scipy.constants
-import scipy.stats
 
 import foveasim as fs
 from foveasim._core.random_streams import Streams

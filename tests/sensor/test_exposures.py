@@ -9,7 +9,6 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import scipy.constants
-import scipy.signal
 
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
@@ -591,7 +590,7 @@ def test_ramp_fits_predict_rts_noise(rts_fraction):
 
 # -- invalid input ----------------------------------------------------------------------------------------------------
 
-FEW = Sensor(ROW[:3], **SENSOR)
+FEW = Sensor(grid(n_x=3, n_y=1, pitch_um=2.0), **SENSOR)
 CODE = np.full((2, 3), 100)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import shapely
-import skimage.data
+import skimage
 from scipy.ndimage import gaussian_filter
 
 import foveasim as fs

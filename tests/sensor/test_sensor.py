@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import scipy.constants
-import scipy.stats
 
 import foveasim as fs
 from foveasim.errors import ParameterError, SimulationError

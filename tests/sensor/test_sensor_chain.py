@@ -10,7 +10,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import scipy.constants
-import scipy.stats
 import shapely
 
 import foveasim as fs
