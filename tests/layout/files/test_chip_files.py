@@ -23,6 +23,8 @@ from foveasim.layout.files._holes import hole_free_rings
 gdstk = pytest.importorskip("gdstk")
 klayout = pytest.importorskip("klayout.db")
 
+pytestmark = pytest.mark.usefixtures("forked_readers")
+
 GDSII_OASIS = ["gds", "oas"]
 MAP = {
     "photosite": (77, 3),

@@ -25,7 +25,10 @@ klayout = pytest.importorskip("klayout.db")
 pq = pytest.importorskip("pyarrow.parquet")
 
 #: The columns of some layouts leave no room for the identity of the sites in GDSII.
-pytestmark = pytest.mark.filterwarnings("ignore:the file does not contain the identity of the sites")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:the file does not contain the identity of the sites"),
+    pytest.mark.usefixtures("forked_readers"),
+]
 
 EXACT = ["npz", "geojson", "parquet"]
 GDSII_OASIS = ["gds", "oas"]
@@ -106,6 +109,15 @@ def test_gdsii_oasis_round_trip_on_database_grid(zoo, tmp_path, extension):
     assert [len(p.interiors) for p in again.polygons()] == [len(p.interiors) for p in zoo.polygons()]
     np.testing.assert_array_equal(again.channel, zoo.channel)
     np.testing.assert_allclose(again.area_um2, shapely.area(expected), rtol=1e-12)
+
+
+@pytest.mark.parametrize("extension", GDSII_OASIS)
+def test_new_process_reads_same_layout(zoo, tmp_path, monkeypatch, extension):
+    write_layout(zoo, tmp_path / f"a.{extension}")
+    forked = read_layout(tmp_path / f"a.{extension}")
+    monkeypatch.undo()
+
+    assert_same(read_layout(tmp_path / f"a.{extension}"), forked)
 
 
 @pytest.mark.parametrize("extension", GDSII_OASIS)
