@@ -77,6 +77,12 @@ def parsed(path):
     return ast.parse(path.read_text())
 
 
+@cache
+def nodes_of(path):
+    """Return all nodes of the syntax tree of a file."""
+    return list(ast.walk(parsed(path)))
+
+
 def offenders(find, paths=MODULES):
     """Return what a function finds in each module, by the path of the module, where it finds anything."""
     found = {str(path.relative_to(PACKAGE)): find(path) for path in paths}
@@ -90,7 +96,7 @@ DECORATORS = {"chart", "layout_edit", "layout_family", "part"}
 
 def registers(path):
     """Return whether a module registers objects."""
-    calls = [node.func for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)]
+    calls = [node.func for node in nodes_of(path) if isinstance(node, ast.Call)]
     names = {call.id for call in calls if isinstance(call, ast.Name)}
     return bool(names & DECORATORS) or "register" in {call.attr for call in calls if isinstance(call, ast.Attribute)}
 
@@ -107,7 +113,7 @@ def test_package_lists_public_names_only():
 
 def imported_subpackages(path):
     subpackages = set()
-    for node in ast.walk(parsed(path)):
+    for node in nodes_of(path):
         names = []
         if isinstance(node, ast.ImportFrom) and node.module:
             names = [node.module, *(f"{node.module}.{a.name}" for a in node.names if node.module == "foveasim")]
@@ -179,14 +185,14 @@ def unnamed_random_numbers(path):
     """Return the names of ``numpy.random`` that a module uses against the rules, and the standard library's ``random``."""
     used = {
         node.attr
-        for node in ast.walk(parsed(path))
+        for node in nodes_of(path)
         if isinstance(node, ast.Attribute)
         and isinstance(node.value, ast.Attribute)
         and node.value.attr == "random"
         and isinstance(node.value.value, ast.Name)
         and node.value.value.id in {"np", "numpy"}
     }
-    modules = {alias.name for node in ast.walk(parsed(path)) if isinstance(node, ast.Import) for alias in node.names}
+    modules = {alias.name for node in nodes_of(path) if isinstance(node, ast.Import) for alias in node.names}
     allowed = {"Generator", "PCG64DXSM", "Philox", "SeedSequence"} if path.name == "random_streams.py" else set()
     if path.parent.name == "effects" or path.name == "kinds.py":
         allowed = {"Generator"}  # the type of what effects draw from
@@ -209,7 +215,7 @@ def test_random_rule_finds_global_state(tmp_path):
 
 def floating_names(path):
     """Return the names of parameters and dataclass fields with float annotations."""
-    for node in ast.walk(parsed(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.FunctionDef):
             arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
             pairs = [(a.arg, a.annotation) for a in arguments if a.annotation is not None]
@@ -254,7 +260,7 @@ def test_cached_properties_have_no_lock():
     using = {
         str(path.relative_to(PACKAGE))
         for path in MODULES
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in nodes_of(path)
         if isinstance(node, ast.ImportFrom)
         and node.module == "functools"
         and "cached_property" in {alias.name for alias in node.names}
@@ -295,7 +301,7 @@ def electronic_parameters(path):
     relative = path.relative_to(PACKAGE)
     if relative.parts[0] == "sensor" or READS_PARAMETERS.get(str(relative), set()) is None:
         return set()
-    nodes = (node for node in ast.walk(parsed(path)) if isinstance(node, ast.Attribute) and node.attr in ELECTRONIC)
+    nodes = (node for node in nodes_of(path) if isinstance(node, ast.Attribute) and node.attr in ELECTRONIC)
     found = {
         node.attr
         for node in nodes

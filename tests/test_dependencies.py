@@ -95,7 +95,10 @@ def imports(path):
     """Imports and calls of a file, without those below ``if TYPE_CHECKING``."""
     found = [ast.parse(path.read_text())]
     for node in found:  # which grows
-        is_for_types = isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
+        is_for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in (
+            vars(node.test).get("id"),
+            vars(node.test).get("attr"),
+        )
         found.extend(node.orelse if is_for_types else ast.iter_child_nodes(node))
     return [node for node in found if isinstance(node, ast.Import | ast.ImportFrom | ast.Call)]
 
