@@ -139,10 +139,10 @@ def covariance_of_squares(layout, side_um, covariance):
     return total
 
 
-@pytest.mark.slow(keep=6)
+@pytest.mark.slow(keep=("-2.0-", "-8.0-", "-32.0-1000"))
 @pytest.mark.parametrize(
     ("side_um", "snr"),
-    [(1.0, 10.0), (2.0, 1000.0), (4.0, 10.0), (8.0, 1000.0), (16.0, 10.0), (32.0, 1000.0), (1.0, 1000.0)],
+    [(1.0, 10.0), (2.0, 1000.0), (4.0, 10.0), (8.0, 1000.0), (16.0, 10.0), (32.0, 1000.0), (1.0, 1000.0), (32.0, 10.0)],
 )
 @pytest.mark.parametrize("sigma_um", [(3.0,), (1.5, 6.0, 24.0)])
 def test_information_of_squares_matches_closed_form(sigma_um, side_um, snr):

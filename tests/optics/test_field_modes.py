@@ -151,7 +151,7 @@ def point_scene(n, row, column, **options):
 @pytest.fixture(scope="module")
 def point_maps():
     """Return scenes of a point, and their maps with the PSF of the point."""
-    points = np.random.default_rng(4).integers(0, 64, (12, 2))
+    points = np.random.default_rng(4).integers(0, 64, (8, 2))
     scenes = [(point_scene(64, *point), point) for point in points]
     return [(scene, map_of_own_psf(LENS, scene, *point)) for scene, point in scenes]
 
@@ -273,6 +273,7 @@ def test_tiles_equal_captures_with_varying_psfs():
     np.testing.assert_array_equal(np.concatenate([tile.code for tile in parts]), whole.code)
 
 
+@pytest.mark.usefixtures("few_points")
 def test_used_lens_with_modes_is_pickled():
     scene, lens = noise(), replace(LENS, field_modes=4)
     expected = lens.power_map(scene).data

@@ -278,7 +278,8 @@ def test_point_images_follow_from_samples():
     np.testing.assert_allclose(*energy, atol=0.008)
 
 
-def test_wavelengths_are_interpolated():
+def test_wavelengths_are_interpolated(monkeypatch):
+    monkeypatch.setattr(_field_modes, "FIELD_POINTS", (3,))
     lens = replace(LENS, seidel=SEIDEL)
     points_um = [(0.0, 0.0), (0.0, 25.0), (0.0, 50.0)]
     psfs = imported(lens, points_um, waves_nm=(500.0, 600.0), n=129, pitch_um=0.9 * STEP_UM)

@@ -88,7 +88,7 @@ ALL_EFFECTS = {
 PHOTO_E = np.repeat([0.0, 0.5, 3.0, 40.0, 99.0, 101.0, 900.0, 3000.0, 4950.0, 5100.0, 20_000.0], 14)
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("bits", [4, 8, 12])
 @pytest.mark.parametrize("companding", ["linear", "root", "log"])
 def test_prediction_with_all_effects_matches_draws(bits, companding):
@@ -99,7 +99,6 @@ def test_prediction_with_all_effects_matches_draws(bits, companding):
     assert_agree(sensor, sensor.expected_electrons(PHOTO_E, 1.0))
 
 
-@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize(
     "parameters",
     [
@@ -395,7 +394,7 @@ def test_prediction_includes_diffusion_and_coupling():
     assert_agree(sensor, expected_e)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("photo_e", [0.0, 60.0, 1500.0, 4990.0, 5100.0, 12_000.0])
 def test_prediction_with_crosstalk_and_all_effects(photo_e):
     layout = grid(n_x=8, n_y=8, pitch_um=3.0)
