@@ -319,6 +319,19 @@ def test_uneven_points_do_not_overshoot():
     assert 0.0 <= light.min() < light.max() <= 1.0
 
 
+def test_cubic_illumination_is_interpolated_exactly():
+    heights_um = np.linspace(0.0, 3000.0, 6)
+    spot = np.exp(-0.5 * np.square(np.hypot(*np.mgrid[-16:17, -16:17]) / 3.0))
+    psfs = PSFGrid.from_arrays(
+        [spot] * 6, x_um=heights_um, y_um=np.zeros(6), wavelength_nm=WAVE_NM, pitch_um=1.0,
+        relative_illumination=1.0 - 0.5 * (heights_um / 3000.0) ** 3,
+    )  # fmt: skip
+    between_um = np.array([200.0, 1000.0, 2500.0])
+    found = with_psfs(psfs).aperture(noise()).illumination(np.column_stack((between_um, np.zeros(3))))
+
+    np.testing.assert_allclose(found, 1.0 - 0.5 * (between_um / 3000.0) ** 3, rtol=1e-6)
+
+
 def test_turned_windows_are_not_cut_off():
     y, x = np.mgrid[-32:33, -8:9]
     spot = np.exp(-0.5 * (np.square(y / 10.0) + np.square(x / 2.0)))
