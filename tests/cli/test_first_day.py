@@ -232,7 +232,15 @@ def test_commands_of_the_readme_run_as_written(tmp_path, foveasim, monkeypatch):
     for name in ("gallery", "layouts"):
         (tmp_path / name).symlink_to(README.parent / name)
 
+    # Smaller layouts with the names of the bundled ones that are compared, which takes a minute.
+    foveal = fs.layout.log_polar(n_sites=1024, min_size_um=3.0, r_max_um=600.0, fovea="rings", stagger=True)
+    layouts = {"foveal_blind_spot": foveal, "square_grid": fs.layout.grid(n_sites=1024, size_um=(1063.0, 1063.0))}
     for command in commands:
+        if command[0] == "compare":
+            assert layouts.keys() <= set(command)
+            for name, layout in layouts.items():
+                layout.write(tmp_path / "small.npz")
+                (tmp_path / "small.npz").rename(tmp_path / name)
         if command[0] not in NOT_RUN:
             result = foveasim(*command, cwd=tmp_path)
             assert result.returncode == 0, (command, result.stderr)
