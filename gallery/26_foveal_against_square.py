@@ -24,15 +24,17 @@ from foveasim.view import save_figure
 N_SITES = 4096
 FIELD_UM = 720.0
 MIN_SIZE_UM = 2.0
+#: Photosites for a test of the script.
+QUICK = {"n_sites": 1681}
 MEASURES = ("psnr_db", "snr_db", "information_bit_per_mm2")
 
 
-def compare() -> fs.compare.Comparison:
+def compare(n_sites: int) -> fs.compare.Comparison:
     """Compare a foveal and a square layout of the same number of sites and width."""
     foveal = fs.layout.log_polar(
-        n_sites=N_SITES, min_size_um=MIN_SIZE_UM, r_max_um=FIELD_UM / 2.0, fovea="rings", stagger=True
+        n_sites=n_sites, min_size_um=MIN_SIZE_UM, r_max_um=FIELD_UM / 2.0, fovea="rings", stagger=True
     )
-    square = fs.layout.grid(n_sites=N_SITES, size_um=(FIELD_UM, FIELD_UM))
+    square = fs.layout.grid(n_sites=n_sites, size_um=(FIELD_UM, FIELD_UM))
     return fs.compare.layouts({"foveal": foveal, "square": square}, n_annuli=6, max_pixels=192)
 
 
@@ -57,10 +59,10 @@ def draw(found: fs.compare.Comparison) -> Figure:
     return figure
 
 
-def main(out_dir: Path) -> None:
+def main(out_dir: Path, n_sites: int = N_SITES) -> None:
     """Write the figure to a directory, and check the differences."""
     out_dir.mkdir(parents=True, exist_ok=True)
-    found = compare()
+    found = compare(n_sites)
     figure = draw(found)
     save_figure(figure, out_dir / "26_foveal_against_square.png", dpi=140)
     print(found)
