@@ -54,6 +54,8 @@ SETS = {
 }
 #: Files whose tests do more in the complete set.
 VARYING = re.compile(r"\b(effort|hypothesis|FOVEASIM_TESTS_ALL)\b")
+#: Files of the probes.
+ADDED = ("conftest.py", "foveasim/_probe.py")
 #: Largest number and duration, with probes, of the tests of each batch; the last one contains all others.
 BATCHES = ((30, 20.0), (300, 120.0), (1500, 600.0))
 #: Processor time after which a run is an endless loop: in addition to, and in durations of its tests; for new kernels, more.
@@ -72,7 +74,7 @@ def restore(tree: Path) -> None:
     if tree == Path(__file__).resolve().parents[1]:
         raise SystemExit("--tree must be a clone, since its files are changed: git clone . ../clone")
     subprocess.run(["git", "-C", tree, "checkout", "--quiet", "--", "."], check=True)
-    (tree / "foveasim/_probe.py").unlink(missing_ok=True)
+    subprocess.run(["git", "-C", tree, "clean", "--quiet", "--force", "--", *ADDED], check=True)
 
 
 @cache

@@ -10,7 +10,6 @@ examples. Runs of named files and directories, and those with FOVEASIM_TESTS=all
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import sys
 from collections import defaultdict
@@ -20,6 +19,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+from browsers import CHROMIUM, open_chromium
 from effort import effort, examples
 
 from foveasim import compile_kernels
@@ -41,7 +41,7 @@ def renderer_is_missing():
 
 
 def chromium_is_missing():
-    return None if shutil.which("chromium") else "no chromium on the path"
+    return None if CHROMIUM else "no chromium on the path"
 
 
 def is_missing(module):
@@ -138,3 +138,13 @@ def pytest_runtest_setup(item):
             pytest.fail(missing)
         elif missing:
             pytest.skip(missing)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = open_chromium(playwright.chromium)
+        yield chromium
+        chromium.close()

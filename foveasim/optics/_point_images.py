@@ -19,6 +19,7 @@ from foveasim._core.validation import Floats, finite_array
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.optics._aperture import PSFModel
+from foveasim.optics._quadrature import gauss_nodes
 from foveasim.optics.otf import circular_otf
 
 #: Default number of PSF samples along either axis, and their pitch in λN.
@@ -28,7 +29,7 @@ POINT_ACROSS = 384
 #: The same for the OTF of an aperture that cannot be integrated.
 OTF_ACROSS = 768
 #: Radial and angular quadratures of the ensquared energy: minimum number of nodes, and additional nodes per λN of the side.
-QUADRATURE_NODES, NODES_PER_LAMBDA_N = 64, 8
+QUADRATURE_NODES, NODES_PER_LAMBDA_N, NODES_STEP = 64, 8, 32
 #: Side (λN) above which the asymptotic PSF gives the ensquared energy to 1e-5.
 MIN_ASYMPTOTIC_SIDE = 100.0
 #: Largest circle or square (λN) for a sampled pupil, whose PSF repeats at eight times this distance.
@@ -144,7 +145,7 @@ def _airy_in_square(side: float) -> float:
     if side > MIN_ASYMPTOTIC_SIDE:
         # Asymptotic mean of the Airy pattern: 1 / (π³ r³), integrated outside the square.
         return 1.0 - 8.0 * math.sqrt(2.0) / (math.pi**3 * side)
-    nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_NODES + int(NODES_PER_LAMBDA_N * side))
+    nodes, weights = gauss_nodes(NODES_STEP * math.ceil((QUADRATURE_NODES + NODES_PER_LAMBDA_N * side) / NODES_STEP))
     s, ds = 0.5 * (nodes + 1.0), 0.5 * weights
     angle, angle_weights = 0.25 * np.pi * 0.5 * (nodes + 1.0), 0.25 * np.pi * 0.5 * weights  # an eighth of the circle
     square = np.sinc(side * np.outer(s, np.cos(angle))) * np.sinc(side * np.outer(s, np.sin(angle)))

@@ -205,7 +205,8 @@ class Curves:
 
 
 @lru_cache(maxsize=256)
-def _gauss(n: int) -> tuple[Floats, Floats]:
+def gauss_nodes(n: int) -> tuple[Floats, Floats]:
+    """Return the nodes and weights of Gauss-Legendre quadrature between -1 and 1."""
     from scipy.special import roots_legendre
 
     node, weight = roots_legendre(n)
@@ -242,7 +243,7 @@ def _n_nodes(phase: Floats, rho: Floats | float = np.inf) -> Ints:
 def _expand(centre: Floats, half: Floats, n: Ints) -> tuple[Ints, Floats, Floats]:
     """Return the interval, position and weight of the Gauss nodes of intervals."""
     sizes, of_interval = np.unique(n, return_inverse=True)
-    rules = [_gauss(int(size)) for size in sizes]
+    rules = [gauss_nodes(int(size)) for size in sizes]
     begin = np.concatenate(([0], np.cumsum(sizes)[:-1])).astype(np.int64)
     interval = np.repeat(np.arange(n.size), n)
     local = np.arange(interval.size) - np.repeat(np.cumsum(n) - n, n)

@@ -5,6 +5,10 @@ from __future__ import annotations
 from functools import cache
 from importlib.resources import files
 
+FIND = """async (part) => (await axe.run(part, { resultTypes: ["violations"] })).violations
+  .filter(({ impact }) => ["serious", "critical"].includes(impact))
+  .flatMap(({ id, nodes }) => nodes.map((node) => [id, String(node.target.at(-1)), node.failureSummary]))"""
+
 
 @cache
 def _script():
@@ -15,10 +19,5 @@ def violations(page, part="html"):
     """Return the serious and critical violations of a part of a page, by its selector: rule, element, and what is wrong."""
     if not page.evaluate("'axe' in window"):
         page.evaluate(_script())
-    rules = page.evaluate("part => axe.run(part)", part)["violations"]
-    return [
-        f"{rule['id']}: {node['target'][-1]}: {' '.join(node['failureSummary'].split())}"
-        for rule in rules
-        if rule["impact"] in ("serious", "critical")
-        for node in rule["nodes"]
-    ]
+    found = page.evaluate(FIND, part)
+    return [f"{rule}: {element}: {' '.join(summary.split())}" for rule, element, summary in found]

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from browsers import watch
 
 from foveasim.studio import _session
 from foveasim.studio._messages import decode_part
@@ -103,17 +104,6 @@ def server(tmp_path_factory):
     running.stop()
 
 
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-    from studio.page_tools import open_chromium
-
-    with sync_playwright() as playwright:
-        chromium = open_chromium(playwright)
-        yield chromium
-        chromium.close()
-
-
 @pytest.fixture
 def visit(server, browser):
     """Open pages; at the end check that they wrote nothing to the console."""
@@ -130,9 +120,7 @@ def visit(server, browser):
             context.add_init_script(script)
         page = context.new_page()
         page.set_default_timeout(TIMEOUT_MS)
-        if is_checked:
-            page.on("console", lambda message: problems.append(message.text))
-        page.on("pageerror", lambda error: problems.append(str(error)))
+        watch(page, problems, is_checked)
         page.goto(address or server.address)
         if options.get("bypass_csp", True) and address is None:  # otherwise its policy forbids to poll conditions
             settle(page)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import shutil
 import socket
 import threading
-import time
 
 import numpy as np
 import yaml
@@ -15,8 +13,6 @@ from waiting import DEADLINE_S
 from foveasim.studio._server import Studio, host_names
 from foveasim.studio._session import Start
 
-#: WebGL by the processor, which every machine has.
-SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 TOKEN = "the-token-of-these-tests-0123456"
 TIMEOUT_MS = 1000 * DEADLINE_S
 #: Whether an element, or the field of a label, has the focus (0), or follows what has it (1) or not (-1).
@@ -99,11 +95,6 @@ class Server:
         return f"http://127.0.0.1:{self.port}/#{TOKEN}"
 
 
-def open_chromium(playwright, *more):
-    """Start the browser, with further arguments."""
-    return playwright.chromium.launch(executable_path=shutil.which("chromium"), args=[*SOFTWARE, *more])
-
-
 def until(page, condition, argument=None):
     page.wait_for_function(condition, arg=argument, timeout=TIMEOUT_MS, polling=20)
 
@@ -143,14 +134,17 @@ def pass_time(page, time_ms):
     page.evaluate("time => { passedMs += time; }", time_ms)
 
 
-def type_ahead(page, text, words=itertools.count(1)):  # noqa: B008
-    """Type the first letters of an option of the selection with the focus, which the browser takes for one word, however late."""
-    session, start_s = page.context.new_cdp_session(page), time.time() + 10.0 * next(words)
-    for k, letter in enumerate(text):
-        key = {"key": letter, "timestamp": start_s + 0.01 * k}
-        session.send("Input.dispatchKeyEvent", {"type": "keyDown", "text": letter, **key})
-        session.send("Input.dispatchKeyEvent", {"type": "keyUp", **key})
-    session.detach()
+def choose(page, label):
+    """Select an option of the selection with the focus by arrow keys."""
+    for _ in range(page.evaluate("document.activeElement.options.length")):
+        distance = page.evaluate(
+            "label => [...document.activeElement.options].findIndex((o) => o.label.startsWith(label)) - document.activeElement.selectedIndex",
+            label,
+        )
+        if distance == 0:
+            return
+        page.keyboard.press("ArrowDown" if distance > 0 else "ArrowUp")
+    raise AssertionError(f"the arrow keys do not reach {label}")
 
 
 def forget_notice(page):
@@ -235,12 +229,10 @@ class Keys:
         self.wait()
 
     def choose(self, selector, label):
-        """Select an option by the first letters of its label."""
+        """Select an option by its label."""
         self.to(selector)
-        type_ahead(self.page, label)
+        choose(self.page, label)
         self.wait()
-        chosen = self.page.evaluate("() => document.activeElement.selectedOptions[0].label")
-        assert chosen.startswith(label), f"{selector}: {chosen} instead of {label}"
 
     def set(self, key, text):
         """Enter the value of a control."""

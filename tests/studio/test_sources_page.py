@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 import zipfile
 
 import numpy as np
 import pytest
+from browsers import open_chromium
 from films import write_film
 
 pytest.importorskip("starlette")
@@ -16,7 +16,6 @@ pytest.importorskip("uvicorn")
 
 from PIL import Image
 from studio.page_tools import (
-    SOFTWARE,
     TIMEOUT_MS,
     change,
     codes,
@@ -276,7 +275,7 @@ def test_source_menu_selects_test_chart(visit):
 
 @pytest.fixture(scope="module")
 def camera_browser(browser):
-    chromium = browser.browser_type.launch(executable_path=shutil.which("chromium"), args=[*SOFTWARE, *FAKE_CAMERA])
+    chromium = open_chromium(browser.browser_type, *FAKE_CAMERA)
     yield chromium
     chromium.close()
 

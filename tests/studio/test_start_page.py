@@ -9,7 +9,7 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
 from reference.accessibility import violations
-from studio.page_tools import SHOT, Server, setting, settle, type_ahead, until
+from studio.page_tools import SHOT, Server, choose, setting, settle, until
 
 import foveasim as fs
 from foveasim.config import bundled_layouts, demo_settings
@@ -139,13 +139,13 @@ def test_new_sensor_is_created_by_keyboard(open_start):
     settle(page)
     page.keyboard.press("h")
     until(page, HAS_CARDS)
-    # Skip, 16 presets, generator, format: typing selects an option.
+    # Skip, 16 presets, generator, format.
     for _ in range(1 + len(demo_settings()) + len(bundled_layouts()) + 1):
         page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.id") == "start-generator"
-    type_ahead(page, "hexagonal")
+    choose(page, "hexagonal")
     page.keyboard.press("Tab")
-    type_ahead(page, "own")
+    choose(page, "own")
     page.keyboard.press("Tab")
     page.keyboard.type("0,9")
     page.keyboard.press("Tab")

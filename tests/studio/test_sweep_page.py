@@ -14,7 +14,7 @@ from reference.accessibility import violations
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from studio.page_tools import Server, change, has_picture, set_value, setting, settle, type_ahead, until
+from studio.page_tools import Server, change, choose, has_picture, set_value, setting, settle, until
 
 from foveasim.config import build_shot, put_setting
 from foveasim.studio._sweeps.running import Sweeps
@@ -179,13 +179,13 @@ def test_sweep_with_the_keyboard_alone(visit):
     page.keyboard.press("Control+A")
     page.keyboard.type("3")
     press_until(page, focus("(e) => e.ariaLabel === 'Result'"))
-    type_ahead(page, "mean")
+    choose(page, "mean")
     page.keyboard.press("Enter")
     press_until(page, focus("(e) => e.textContent === 'Run'"))
     page.keyboard.press("Enter")
     until(page, IS_DONE)
     press_until(page, focus("(e) => e.ariaLabel === 'Chart'"))
-    type_ahead(page, "Table")
+    choose(page, "Table")
     page.keyboard.press("Enter")
     press_until(page, focus("(e) => e.textContent === 'Apply'"))
     assert page.evaluate("document.activeElement.ariaLabel") == "Apply exposure 10 µs"

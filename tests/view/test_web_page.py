@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import shapely
 import shapely.affinity
+from browsers import watch
 from matplotlib import colormaps
 from reference.ray_casting import first_hits, rays_of
 from waiting import wait_until
@@ -251,8 +252,7 @@ def visit(browser, tmp_path):
         if script:
             context.add_init_script(script)
         page = context.new_page()
-        page.on("console", lambda message: problems.append(message.text))
-        page.on("pageerror", lambda error: problems.append(str(error)))
+        watch(page, problems)
         page.on("request", lambda request: requested.append(request.url))
         page.goto(path.as_uri() + hash_text)
         page.evaluate("foveasim.complete")

@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from browsers import watch
 from waiting import wait_until
 
 import foveasim as fs
@@ -64,8 +65,7 @@ def show(browser):
     def open_widget(widget, *, style="color: black"):
         contexts.append(browser.new_context(viewport={"width": 900, "height": 600}, reduced_motion="reduce"))
         page = contexts[-1].new_page()
-        page.on("console", lambda message: problems.append(message.text))
-        page.on("pageerror", lambda error: problems.append(str(error)))
+        watch(page, problems)
         page.on("request", lambda request: requested.append(request.url))
         page.set_content(f'<body style="{style}; margin: 0"></body>')
 

@@ -1,0 +1,24 @@
+"""Chromium for the tests of pages."""
+
+from __future__ import annotations
+
+import shutil
+
+#: Without the interface of the browser, where it is installed: a page takes half the processor time.
+CHROMIUM = shutil.which("chromium-headless-shell") or shutil.which("chromium")
+#: WebGL by the processor, which every machine has.
+ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+#: What the driver of Chromium writes to the console when a page reads the pixels of a canvas.
+DRIVER_MESSAGE = "GL Driver Message"
+
+
+def open_chromium(browser_type, *more):
+    """Start the browser, with further arguments."""
+    return browser_type.launch(executable_path=CHROMIUM, args=[*ARGUMENTS, *more])
+
+
+def watch(page, problems, is_console_checked=True):
+    """Append the errors of a page, and what it writes to the console, to a list."""
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    if is_console_checked:
+        page.on("console", lambda message: DRIVER_MESSAGE in message.text or problems.append(message.text))
