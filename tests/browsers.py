@@ -6,8 +6,10 @@ import shutil
 
 #: Without the interface of the browser, where it is installed: a page takes half the processor time.
 CHROMIUM = shutil.which("chromium-headless-shell") or shutil.which("chromium")
-#: WebGL by the processor, which every machine has.
-ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+#: WebGL by the processor, which every machine has; not for composing the page, which would take longer.
+ARGUMENTS = (
+    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing",
+)  # fmt: skip
 #: What the driver of Chromium writes to the console when a page reads the pixels of a canvas.
 DRIVER_MESSAGE = "GL Driver Message"
 

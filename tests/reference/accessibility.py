@@ -15,6 +15,15 @@ def _script():
     return (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
 
 
+def violations_in_themes(page, part="html"):
+    """Return the violations in the light and in the dark theme; the light one is left."""
+    found = []
+    for scheme in ("dark", "light"):
+        page.emulate_media(color_scheme=scheme)
+        found += [f"{scheme}: {text}" for text in violations(page, part)]
+    return found
+
+
 def violations(page, part="html"):
     """Return the serious and critical violations of a part of a page, by its selector: rule, element, and what is wrong."""
     if not page.evaluate("'axe' in window"):

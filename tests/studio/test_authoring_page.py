@@ -542,12 +542,13 @@ def test_typed_positions_replace_each_other(edit):
 
 @pytest.mark.parametrize("width", [390, 1280, 2560])
 def test_editor_fits_width(edit, width):
+    page = edit("polygon", width=width, height=844 if width < 500 else width * 9 // 16)
     for scheme in ("light", "dark"):
-        page = edit("polygon", width=width, height=844 if width < 500 else width * 9 // 16, color_scheme=scheme)
+        page.emulate_media(color_scheme=scheme)
+        settle(page)
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert page.locator("#map").bounding_box()["width"] > 200
         assert page.locator(".tool-strip button").last.is_visible()
-        settle(page)
 
 
 @pytest.mark.filterwarnings("ignore:the layout measures")

@@ -631,13 +631,14 @@ def test_keyboard_alone_changes_and_undoes(visit):
 
 @pytest.mark.parametrize("width", [390, 1280, 2560])
 def test_page_fits_width_in_both_themes(visit, width):
+    page = visit(width=width, height=844 if width < 500 else width * 9 // 16)
+    page.click("[data-tile=rules]")
+    page.click("#freeze")
+    settle(page)
     grounds = set()
     for scheme in ("light", "dark"):
-        page = visit(width=width, height=844 if width < 500 else width * 9 // 16, color_scheme=scheme)
-        page.click("[data-tile=rules]")
-        page.click("#freeze")
+        page.emulate_media(color_scheme=scheme)
         settle(page)
-
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         for name in ("#map", "#map-a", "#picture", "#scene", "#sections"):
             assert page.locator(name).bounding_box()["width"] > 60, name
