@@ -367,8 +367,12 @@ def test_any_exception_of_metric_is_reported():
     assert found["error"].values.tolist() == [f"raising: {kind}: why" for kind in kinds]
 
 
-def pausing_plan(when):
-    """Plan a sweep with a metric that pauses its worker permanently, as dask does when its memory is full."""
+def pausing_plan(when, directory=None):
+    """
+    Plan a sweep with a metric that pauses its worker permanently, as dask does when its memory is full.
+
+    Paused workers create a file in the directory.
+    """
 
     def pausing(_, camera, __):
         from distributed import Status, get_worker
@@ -376,6 +380,8 @@ def pausing_plan(when):
         if when(camera.sensor.bits):
             get_worker().memory_manager.memory_pause_fraction = False  # prevents dask from resuming the worker
             get_worker().status = Status.paused
+            if directory is not None:
+                (directory / f"{os.getpid()}").touch()
         time.sleep(SLOW_S)
         return os.getpid()
 
@@ -393,14 +399,21 @@ def test_tasks_of_paused_worker_are_moved(monkeypatch):
 
 
 @pytest.mark.slow
-def test_pause_of_all_workers_is_reported(monkeypatch):
+def test_pause_of_all_workers_is_reported(monkeypatch, tmp_path):
     monkeypatch.setattr("foveasim.explore.cluster.PAUSED_S", 1.0)
-    monkeypatch.setattr("foveasim.explore.executor.NO_WORKER_TIMEOUT_S", 1.0)
+
+    def shorten():  # the workers may start slowly
+        wait_until(lambda: len(list(tmp_path.iterdir())) == 2)
+        monkeypatch.setattr("foveasim.explore.executor.NO_WORKER_TIMEOUT_S", 1.0)
+
+    shortening = threading.Thread(target=shorten)
+    shortening.start()
     with pytest.raises(
         SimulationError,
         match=r"no worker has computed anything for 1 s: all are closing, or paused.*; \d+ of 12 points are done",
     ):
-        with_timeout(lambda: explore.run_sweep(pausing_plan(lambda _: True), workers=2))
+        with_timeout(lambda: explore.run_sweep(pausing_plan(lambda _: True, tmp_path), workers=2))
+    shortening.join()
 
 
 @pytest.mark.slow
