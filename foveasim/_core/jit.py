@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -181,11 +182,14 @@ def compile_kernels(*, n_workers: int | None = None) -> int:
     60
     """
     n_workers = thread_count() if n_workers is None else check_count("n_workers", n_workers)
-    kernels = sorted(_all_kernels(), key=_cost, reverse=True)
-    shares: list[list[Kernel]] = [[] for _ in range(min(n_workers, len(kernels)))]
-    for kernel in kernels:
-        min(shares, key=lambda share: sum(map(_cost, share))).append(kernel)
+    kernels = list(_all_kernels())
     if n_workers > 1:
+        shares: list[list[Kernel]] = [[] for _ in range(min(n_workers, len(kernels)))]
+        costs = [0] * len(shares)
+        for cost, kernel in sorted(((_cost(kernel), kernel) for kernel in kernels), key=itemgetter(0), reverse=True):
+            least = costs.index(min(costs))
+            shares[least].append(kernel)
+            costs[least] += cost
         with ThreadPoolExecutor(len(shares)) as pool:
             if all(pool.map(_compile_in_process, shares)):
                 return len(kernels)

@@ -168,7 +168,7 @@ def describe(layout: Layout, readout: Readout | None = None) -> Summary:
     Summary(400 photosites of 2.792 µm on 61.5 x 52.8275 µm, from hexagonal)
     """
     bounds_um = layout.bounds_um
-    hull_um2 = float(shapely.MultiPoint(layout.xy_um).convex_hull.area)
+    hull_um2 = float(shapely.LineString(layout.xy_um).convex_hull.area)
     size_um = layout.size_um
     edges_um = _size_edges_um(float(size_um.min()), float(size_um.max()))
     channel, counts = np.unique(layout.channel, return_counts=True)

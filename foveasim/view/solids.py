@@ -215,7 +215,7 @@ class Solids:
         Without trenches this is the fill factor of the layout, as in :func:`foveasim.layout.describe`; with trenches, that of
         ``inset(layout, trench_width_um / 2)`` on the same hull.
         """
-        hull_um2 = float(shapely.MultiPoint(self.layout.xy_um).convex_hull.area)
+        hull_um2 = float(shapely.LineString(self.layout.xy_um).convex_hull.area)
         return float(self.volumes_um3("wells").sum()) / (hull_um2 * self.sensor_stack.well_depth_um)
 
     def check(self) -> SolidsReport:
