@@ -64,6 +64,7 @@ class Server:
         import uvicorn
 
         listener = socket.create_server(("127.0.0.1", self.port), reuse_port=False)
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.port = listener.getsockname()[1]
         self.studio = Studio(self.start_of, token=TOKEN, hosts=host_names("127.0.0.1", self.port))
         self.server = uvicorn.Server(
@@ -71,7 +72,9 @@ class Server:
                 self.studio.app,
                 log_level="critical",
                 lifespan="off",
+                access_log=False,
                 ws="websockets-sansio",
+                ws_per_message_deflate=False,
                 timeout_graceful_shutdown=0,
             )
         )
