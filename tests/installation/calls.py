@@ -246,6 +246,10 @@ class Objects:
         return fs.explore.plan_sweep(SHOT, VARY)
 
     @cached_property
+    def swept(self):
+        return self.written(".zarr", lambda path: explore.run_sweep(self.plan, out=path, workers=1))
+
+    @cached_property
     def study_plan(self):
         return fs.explore.plan_study(SHOT, SEARCH, GOALS, n_trials=2)
 
@@ -321,6 +325,8 @@ LENGTH = np.array([1.0, 2.0])
 TRIANGLE = [[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]]
 SQUARE = shapely.box(-3.0, -3.0, 3.0, 3.0)
 POINT = [[0.1, 0.2]]
+#: Bundled layout with the fewest sites.
+BUNDLED = "prima_75"
 #: Names relative to the package, and functions of :class:`Objects`.
 CALLS = {
     "compile_kernels": lambda o: fs.compile_kernels(),
@@ -393,8 +399,8 @@ CALLS = {
     "config.picture_path": lambda o: config.picture_path(with_settings_files(o), "photos/cats/1.png", "scene.picture"),
     "config.get_setting": lambda o: config.get_setting(SHOT, "sensor.bits"),
     "config.put_setting": lambda o: config.put_setting(None, json.loads(json.dumps(SHOT)), "sensor.bits", 10),
-    "config.read_any_layout": lambda o: config.read_any_layout(next(iter(config.bundled_layouts()))),
-    "config.read_layout_file": lambda o: config.read_layout_file(next(iter(config.bundled_layouts().values()))),
+    "config.read_any_layout": lambda o: config.read_any_layout(BUNDLED),
+    "config.read_layout_file": lambda o: config.read_layout_file(config.bundled_layouts()[BUNDLED]),
     "config.read_rules": lambda o: config.read_rules("sky130_met1"),
     "config.read_settings": lambda o: config.read_settings(o.shot_file),
     "config.read_shot": lambda o: config.read_shot(o.shot_file),
@@ -447,9 +453,7 @@ CALLS = {
     "explore.open_dataset": lambda o: explore.open_dataset(
         o.written("", lambda p: explore.write_dataset(o.dataset, p))
     )[1],
-    "explore.open_results": lambda o: explore.open_results(
-        o.written(".zarr", lambda p: explore.run_sweep(o.plan, out=p, workers=1))
-    ),
+    "explore.open_results": lambda o: explore.open_results(o.swept),
     "explore.parse_distribution": lambda o: explore.parse_distribution("optics.f_number", {"uniform": [2.0, 4.0]}),
     "explore.plan_study": lambda o: explore.plan_study(SHOT, SEARCH, GOALS, n_trials=2),
     "explore.plan_sweep": lambda o: explore.plan_sweep(SHOT, VARY),
@@ -695,9 +699,7 @@ CALLS = {
     "view.plot_picture": lambda o: view.plot_picture(o.picture),
     "view.plot_power_map": lambda o: view.plot_power_map(o.power_map),
     "view.plot_report": lambda o: view.plot_report(o.report),
-    "view.plot_results": lambda o: view.plot_results(
-        explore.open_results(o.written(".zarr", lambda p: explore.run_sweep(o.plan, out=p, workers=1)))
-    ),
+    "view.plot_results": lambda o: view.plot_results(explore.open_results(o.swept)),
     "view.plot_scene": lambda o: view.plot_scene(o.scene),
     "view.plotter": lambda o: view.plotter(o.layout, off_screen=True),
     "view.polydata": lambda o: view.polydata(o.layout),
@@ -752,10 +754,10 @@ COMMANDS = {
     ],
     "compile": lambda o: [],
     "layouts": lambda o: [],
-    "describe": lambda o: [next(iter(config.bundled_layouts())), "--fps", "30"],
+    "describe": lambda o: [BUNDLED, "--fps", "30"],
     "convert": lambda o: [o.written(".npz", o.layout.write), o.path(".geojson")],
     "convert gds": lambda o: [o.written(".npz", o.layout.write), o.path(".gds")],
-    "view": lambda o: [next(iter(config.bundled_layouts())), "--out", o.path(".html")],
+    "view": lambda o: [BUNDLED, "--out", o.path(".html")],
     "view --solid": lambda o: [o.written(".npz", o.layout.write), "--solid", "--out", o.path(".html")],
     "studio": lambda o: [o.shot_file, "--no-browser"],
     "compare": lambda o: [
@@ -771,7 +773,7 @@ COMMANDS = {
         o.path(".html"),
     ],
     "sweep": lambda o: [o.sweep_file, "--workers", "1", "--out", o.path(".zarr")],
-    "plot": lambda o: [o.written(".zarr", lambda p: explore.run_sweep(o.plan, out=p, workers=1))],
+    "plot": lambda o: [o.swept],
     "study": lambda o: [o.study_file, "--out", o.path(".db")],
     "study --workers": lambda o: [o.study_file, "--workers", "1", "--out", o.path(".db")],
     "dataset": lambda o: [o.dataset_file, "--out", o.path("")],
