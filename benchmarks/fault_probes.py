@@ -28,11 +28,15 @@ def reached(*numbers):
             except OSError:  # in the sandbox
                 pass
 """
+#: The file is open from the start, since tests replace the functions that open files.
 DURATIONS = """
+import os
+
+_seconds = open(f"{DIRECTORY}/{os.getpid()}.seconds", "a")
+
 def pytest_runtest_logreport(report):
-    import os
-    with open(f"{DIRECTORY}/{os.getpid()}.seconds", "a") as file:
-        file.write(f"{report.duration:.4f}\\t{report.when}\\t{report.nodeid}\\n")
+    _seconds.write(f"{report.duration:.4f}\\t{report.when}\\t{report.nodeid}\\n")
+    _seconds.flush()
 """
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
