@@ -15,14 +15,20 @@ from foveasim.studio._session import Start
 
 TOKEN = "the-token-of-these-tests-0123456"
 TIMEOUT_MS = 1000 * DEADLINE_S
-#: Whether an element, or the field of a label, has the focus (0), or follows what has it (1) or not (-1).
-DIRECTION = """(selector) => {
+#: Number of Tab presses to an element, or to the field of a label: negative backwards, 0 if it has the focus.
+N_TABS = """(selector) => {
   const text = selector.startsWith("label=") ? selector.slice(6) : null, { activeElement } = document;
   const all = text === null ? [...document.querySelectorAll(selector)]
     : [...document.querySelectorAll("label")].filter((label) => label.textContent.startsWith(text)).map((label) => label.control);
   if (all.includes(activeElement)) return 0;
   const target = all.find((element) => element.checkVisibility()) || document.body;
-  return activeElement.compareDocumentPosition(target) & Node.DOCUMENT_POSITION_PRECEDING ? -1 : 1;
+  const follows = (one, other) => one.compareDocumentPosition(other) & Node.DOCUMENT_POSITION_FOLLOWING;
+  const isBack = activeElement.compareDocumentPosition(target) & Node.DOCUMENT_POSITION_PRECEDING;
+  const [first, last] = isBack ? [target, activeElement] : [activeElement, target];
+  const stops = [...document.querySelectorAll("a[href], button, input, select, textarea, summary, [tabindex]")].filter((each) =>
+    each.tabIndex >= 0 && !each.disabled && !each.closest("[inert]") && each.checkVisibility({ visibilityProperty: true }));
+  const n = 1 + stops.filter((each) => follows(first, each) && follows(each, last)).length;
+  return isBack ? -n : n;
 }"""
 #: A foveal colour sensor of 1,152 photosites with design rules.
 SHOT = yaml.safe_load("""
@@ -204,13 +210,23 @@ class Keys:
         for key in keys:
             self.page.keyboard.press(key)
 
+    def hold_tab(self, n, *, is_back):
+        """Hold Tab until it has repeated a number of times."""
+        if is_back:
+            self.page.keyboard.down("Shift")
+        for _ in range(n):
+            self.page.keyboard.down("Tab")
+        self.page.keyboard.up("Tab")
+        if is_back:
+            self.page.keyboard.up("Shift")
+
     def to(self, selector):
         """Move the focus to an element, or to the field of a label: ``"label=..."``."""
-        for _ in range(400):
-            direction = self.page.evaluate(DIRECTION, selector)
-            if direction == 0:
+        for _ in range(100):  # the browser may have stops of its own, such as areas that scroll
+            n_tabs = self.page.evaluate(N_TABS, selector)
+            if n_tabs == 0:
                 return
-            self.press("Tab" if direction > 0 else "Shift+Tab")
+            self.hold_tab(abs(n_tabs), is_back=n_tabs < 0)
         raise AssertionError(f"Tab does not reach {selector}")
 
     def use(self, selector):
@@ -254,7 +270,7 @@ class Keys:
         """Move to an entry of the menu of files."""
         self.use("#file")
         for _ in range(20):
-            if self.page.evaluate(DIRECTION, selector) == 0:
+            if self.page.evaluate(N_TABS, selector) == 0:
                 return
             self.press("ArrowDown")
         raise AssertionError(f"the menu has no {selector}")
