@@ -783,7 +783,8 @@ def other_values(control):
             value = low + 0.3 * (high - low)
             return [round(value) if control["kind"] == "integer" else value]
         case "choice":
-            return [choice["value"] for choice in control["choices"]][-2:]
+            # The PSF of a picture as pupil takes seconds.
+            return [each["value"] for each in control["choices"] if "skimage:" not in str(each["value"])][-2:]
         case "boolean":
             return [not control.get("default", False)]
         case "list" if control.get("default"):
@@ -794,10 +795,11 @@ def other_values(control):
 
 @pytest.mark.slow
 def test_no_setting_leaves_stale_views(make_session, settings):
-    lens = {"kind": "brown_conrady", "focal_um": 8000.0, "radial": [-0.1], "centre_um": [1.0, 0.5]}
+    lens = {"kind": "brown_conrady", "focal_um": 8000.0, "k1": -0.1, "centre_um": [1.0, 0.5]}
     settings = {**settings, "distortion": lens}
     recorder = make_session(start=settings)
-    recorder.do(do="views", names=[name for name, part in _session.PARTS.items() if not part.is_costly])
+    names = [name for name, part in _session.PARTS.items() if not part.is_costly]
+    recorder.do(do="views", names=names)
     shown, stale, n_changes = {}, [], 0
 
     def receive():
@@ -817,11 +819,13 @@ def test_no_setting_leaves_stale_views(make_session, settings):
                 continue
             n_changes += 1
             before = dict(shown)
-            recorder.do(do="refresh")
+            for name in set(names) - set(recorder.part_names):  # those sent are of the new state
+                recorder.session._views.forget(name)
+            recorder.do(do="views", names=names)
             receive()
             stale += [(control["key"], name) for name in shown if not is_same(before[name], shown[name])]
-        recorder.do(do="restore", settings=settings)
+        assert recorder.do(do="restore", settings=settings)["errors"] == {}, control["key"]
         receive()
 
     assert stale == []
-    assert n_changes > len(controls) // 2, (n_changes, len(controls))
+    assert n_changes > len(controls), (n_changes, len(controls))
