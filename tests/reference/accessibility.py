@@ -5,7 +5,9 @@ from __future__ import annotations
 from functools import cache
 from importlib.resources import files
 
-FIND = """async (part) => (await axe.run(part, { resultTypes: ["violations"] })).violations
+#: Rules whose results depend on the theme.
+OF_COLOURS = ["color-contrast", "link-in-text-block"]
+FIND = """async ([part, rules]) => (await axe.run(part, { resultTypes: ["violations"], ...(rules && { runOnly: rules }) })).violations
   .filter(({ impact }) => ["serious", "critical"].includes(impact))
   .flatMap(({ id, nodes }) => nodes.map((node) => [id, String(node.target.at(-1)), node.failureSummary]))"""
 
@@ -16,17 +18,21 @@ def _script():
 
 
 def violations_in_themes(page, part="html"):
-    """Return the violations in the light and in the dark theme; the light one is left."""
+    """Return the violations in the light theme, and those of colours in the dark one; the light one is left."""
     found = []
-    for scheme in ("dark", "light"):
+    for scheme, rules in (("dark", OF_COLOURS), ("light", None)):
         page.emulate_media(color_scheme=scheme)
-        found += [f"{scheme}: {text}" for text in violations(page, part)]
+        found += [f"{scheme}: {text}" for text in violations(page, part, rules)]
     return found
 
 
-def violations(page, part="html"):
-    """Return the serious and critical violations of a part of a page, by its selector: rule, element, and what is wrong."""
+def violations(page, part="html", rules=None):
+    """
+    Return the serious and critical violations of a part of a page, by its selector: rule, element, and what is wrong.
+
+    ``rules``: names of those that are applied; None for all.
+    """
     if not page.evaluate("'axe' in window"):
         page.evaluate(_script())
-    found = page.evaluate(FIND, part)
+    found = page.evaluate(FIND, [part, rules])
     return [f"{rule}: {element}: {' '.join(summary.split())}" for rule, element, summary in found]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 
 import numpy as np
@@ -541,10 +542,10 @@ def test_typed_positions_replace_each_other(edit):
     assert edits(page)[0]["outlines_um"] == [[[-100, -100], [-90, -100], [-90, -89.5]]]
 
 
-@pytest.mark.parametrize("width", [390, 1280, 2560])
-def test_editor_fits_width(edit, width):
-    page = edit("polygon", width=width, height=844 if width < 500 else width * 9 // 16)
-    for scheme in ("light", "dark"):
+def test_editor_fits_width(edit):
+    page = edit("polygon", width=2560, height=1440)
+    for width, scheme in itertools.product((2560, 1280, 390), ("light", "dark")):
+        page.set_viewport_size({"width": width, "height": 844 if width < 500 else width * 9 // 16})
         page.emulate_media(color_scheme=scheme)
         settle(page)
         assert page.evaluate("document.documentElement.scrollWidth") <= width

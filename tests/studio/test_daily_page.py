@@ -113,17 +113,17 @@ def test_first_tiles_have_content(visit):
 
 
 @pytest.mark.slow(keep=1)
-@pytest.mark.parametrize("most", [1, 7, 912, 3890, 14_208, 1_000_000])
-def test_root_axes_have_round_ticks(visit, most):
+def test_root_axes_have_round_ticks(visit):
     page = visit()
-    ticks = page.evaluate("async most => (await import('/static/charts.js')).rootTicks(most)", most)
+    for most in (1, 7, 912, 3890, 14_208, 1_000_000):
+        ticks = page.evaluate("async most => (await import('/static/charts.js')).rootTicks(most)", most)
 
-    assert ticks
-    assert ticks == sorted(ticks, reverse=True)
-    assert ticks[0] <= most < 2 * ticks[0]
-    assert all(tick == int(tick) and len(str(int(tick)).rstrip("0")) <= 2 for tick in ticks)
-    positions = np.sqrt(np.array(ticks) / most)
-    assert (np.diff(positions) <= -0.2).all()
+        assert ticks, most
+        assert ticks == sorted(ticks, reverse=True)
+        assert ticks[0] <= most < 2 * ticks[0]
+        assert all(tick == int(tick) and len(str(int(tick)).rstrip("0")) <= 2 for tick in ticks), most
+        positions = np.sqrt(np.array(ticks) / most)
+        assert (np.diff(positions) <= -0.2).all(), most
 
 
 def test_curves_differ_by_more_than_hue(visit):
