@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import threading
 
 import numpy as np
@@ -147,7 +148,7 @@ FRONTS = [
 
 
 def test_pareto_front_follows_its_definition(visit):
-    page = open_sweep(visit)
+    page = visit()
     for points, is_smaller, expected in FRONTS:
         found = page.evaluate(
             "async ([points, isSmaller]) => (await import('/static/sweep_points.js')).paretoFront(points.map((p) => p.map((v) => v ?? NaN)), isSmaller)",
@@ -291,23 +292,25 @@ def test_missing_points_have_a_reason(visit):
     assert "–" in page.inner_text("#tile-sweep tbody")
 
 
-@pytest.mark.parametrize(
-    ("width", "height", "scheme"), [(390, 844, "light"), (1280, 800, "dark"), (1920, 1080, "light")]
-)
-def test_sweep_fits_and_is_accessible(visit, width, height, scheme):
-    page = open_sweep(visit, width=width, height=height, color_scheme=scheme)
+def test_sweep_fits_and_is_accessible(visit):
+    page = open_sweep(visit, width=1920, height=1080)
     choose_axis(page, "Setting", "exposure_s", n=3)
     choose_axis(page, "Second setting", "optics.f_number", n=3)
     group(page, "Second result").locator("select[aria-label=Result]").select_option(value="mtf")
     group(page, "Second result").locator("input[aria-label^=Spatial]").fill("20")
     run(page)
-    for what in page.locator("#tile-sweep select[aria-label=Chart] option").evaluate_all(
-        "all => all.map((o) => o.value)"
+    charts = page.locator("#tile-sweep select[aria-label=Chart]")
+    for (width, height, scheme), what in itertools.product(
+        ((390, 844, "light"), (1280, 800, "dark"), (1920, 1080, "light")),
+        charts.locator("option").evaluate_all("all => all.map((o) => o.value)"),
     ):
-        page.locator("#tile-sweep select[aria-label=Chart]").select_option(value=what)
+        charts.select_option(value=what)
+        page.set_viewport_size({"width": width, "height": height})
+        page.emulate_media(color_scheme=scheme)
+        settle(page)
         boxes = page.evaluate(
             "() => [document.documentElement, ...document.querySelectorAll('#tile-sweep, .sweep-form, .sweep-results')]"
             ".map((e) => e.scrollWidth - e.clientWidth)"
         )
-        assert max(boxes) <= 0, (what, boxes)
-        assert violations(page, "#tile-sweep") == []
+        assert max(boxes) <= 0, (what, width, boxes)
+        assert violations(page, "#tile-sweep") == [], (what, width, scheme)

@@ -241,7 +241,7 @@ def test_layers_are_stacked_and_cut(visit):
     ]
     assert "Silicon 3 µm" in page.inner_text("#solid-text")
     found = page.evaluate("""() => { const { view } = studio.solid, seen = new Set(); view.updateIds();
-      for (let x = 0; x < view.orbit.width; x += 2) for (let y = 0; y < view.orbit.tall; y += 2) { const { part } = view.pick(x, y); if (part >= 0) seen.add(view.parts[part].name); } return [...seen]; }""")
+      for (let x = 0; x < view.orbit.width; x += 7) for (let y = 0; y < view.orbit.tall; y += 7) { const { part } = view.pick(x, y); if (part >= 0) seen.add(view.parts[part].name); } return [...seen]; }""")
     assert {"wells", "filters", "lenses"} <= set(found)
     page.evaluate(
         "() => { const s = document.getElementById('solid-cut'); s.value = 0; s.dispatchEvent(new Event('input')); }"
