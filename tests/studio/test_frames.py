@@ -13,8 +13,10 @@ import pytest
 import yaml
 from films import write_film
 from PIL import Image
+from typer.testing import CliRunner
 
 from foveasim.capture import Capture
+from foveasim.cli import app
 from foveasim.errors import ParameterError
 from foveasim.studio._comparison import compare, fovea_um
 from foveasim.studio._engine import Engine
@@ -58,8 +60,8 @@ def codes(recorder):
 
 def run_settings(path, out):
     """Return the codes of ``foveasim run``."""
-    command = [sys.executable, "-m", "foveasim", "run", str(path), "--out", str(out)]
-    subprocess.run(command, check=True, capture_output=True, cwd=path.parent)
+    result = CliRunner().invoke(app, ["run", str(path), "--out", str(out)])
+    assert result.exit_code == 0, result.output
     return Capture.load(out / f"{path.stem}_capture.npz").code
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
@@ -16,6 +15,7 @@ from reference.accessibility import violations_in_themes
 from studio.page_tools import Keys, change, codes, drop, hold_clock, pass_time, set_value, setting, settle, until
 from studio.test_sources_page import film, hold_frames, video
 
+from foveasim.cli import app
 from foveasim.config import read_shot
 from foveasim.video import GazePath, read_recording
 
@@ -168,8 +168,9 @@ def test_recorded_video_runs_on_command_line(visit, server, tmp_path):
     change(page, "name => { studio.connection.send({ do: 'save', name }); }", name)
     saved = server.start_of.out / name
     (tmp_path / "clip.mp4").write_bytes(content)
-    command = [sys.executable, "-m", "foveasim", "video", str(saved), "--frames", str(tmp_path / "clip.mp4")]
-    subprocess.run([*command, "--out", str(tmp_path / "codes.zarr")], check=True, capture_output=True)
+    command = ["video", str(saved), "--frames", str(tmp_path / "clip.mp4"), "--out", str(tmp_path / "codes.zarr")]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
     recording = read_recording(tmp_path / "codes.zarr")
     np.testing.assert_allclose(recording.gaze_um, [interpolated(rows, n * FRAME_S) for n in range(12)], atol=1e-9)
     assert read_shot(saved).gaze_path.rows.tolist() == rows
