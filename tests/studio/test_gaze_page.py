@@ -221,7 +221,7 @@ def test_gaze_follows_pointer_while_video_plays(visit, tmp_path):
 # -- replay -------------------------------------------------------------------------------------------------------------------
 
 
-def test_replay_over_picture_follows_the_path(visit):
+def test_replay_and_slider_follow_the_path(visit):
     page = visit()
     with_rows(page)
     n_steps = steps(page)
@@ -239,6 +239,14 @@ def test_replay_over_picture_follows_the_path(visit):
     assert page.inner_text("#gaze .quiet") == "0.40 s · -200.0, 100.0 µm"
     assert page.evaluate("studio.panes.scene.position") == ROWS[-1][1:]
     assert steps(page) == n_steps + 1
+
+    before = steps(page)
+    page.locator("#gaze input[type=range]").fill("3")
+    settle(page)
+
+    assert gaze(page) == pytest.approx(interpolated(ROWS, 0.1))
+    assert page.locator("#gaze input[type=range]").get_attribute("aria-valuetext").startswith("0.10 s")
+    assert steps(page) == before + 1
 
 
 def test_pause_keeps_the_last_position(visit):
@@ -435,15 +443,3 @@ def test_row_has_no_serious_violations(visit):
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         page.keyboard.press("Escape")
         page.wait_for_selector("#saccades-dialog", state="hidden")
-
-
-def test_slider_shows_times_of_the_path(visit):
-    page = visit()
-    with_rows(page)
-    before = steps(page)
-    page.locator("#gaze input[type=range]").fill("3")
-    settle(page)
-
-    assert gaze(page) == pytest.approx(interpolated(ROWS, 0.1))
-    assert page.locator("#gaze input[type=range]").get_attribute("aria-valuetext").startswith("0.10 s")
-    assert steps(page) == before + 1

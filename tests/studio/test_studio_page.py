@@ -9,6 +9,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
@@ -143,7 +144,7 @@ def show_first_violation(page):
     page.locator(".violations button").first.click()
 
 
-def test_violation_moves_the_view(visit):
+def test_violation_moves_view_until_layout_changes(visit):
     page = visit()
     show_first_violation(page)
     until(page, "() => studio.page.asked === null")
@@ -153,10 +154,6 @@ def test_violation_moves_the_view(visit):
     assert (view["x"], view["y"]) == pytest.approx((0.5 * (x0 + x1), 0.5 * (y0 + y1)), abs=1e-6)
     assert view["span"] < 400.0
 
-
-def test_violations_of_earlier_layout_vanish(visit):
-    page = visit()
-    show_first_violation(page)
     page.click("[data-tile=rules]")
     page.evaluate("""() => { const { violations } = studio.rules; window.nDrawn = 0;
       violations.drawMarkers = () => { window.nDrawn++; }; studio.panes.b.shown = {}; studio.panes.b.draw(); }""")
@@ -343,21 +340,7 @@ def test_error_is_next_to_its_control(visit):
     assert page.locator(".control .error:not([hidden])").count() == 0
 
 
-def test_changed_settings_are_marked_and_reset(visit):
-    page = visit()
-    set_value(page, "optics.f_number", 8)
-    row = page.locator(".control[data-key='optics.f_number']")
-
-    assert "changed" in row.get_attribute("class")
-    assert page.inner_text(".section[data-section=optics] .count") == "1"
-    page.click("#only-changed")
-    assert page.locator(".control:visible").count() == 1
-    row.locator(".reset").click()
-    until(page, "() => studio.state.settings.optics.f_number === 2.8")
-    assert "changed" not in row.get_attribute("class")
-
-
-def test_search_finds_settings_by_words(visit):
+def test_settings_are_found_marked_and_reset(visit):
     page = visit()
     page.keyboard.press("/")
     page.keyboard.type("prnu")
@@ -368,6 +351,17 @@ def test_search_finds_settings_by_words(visit):
     assert page.is_visible(".none")
     page.keyboard.press("Escape")
     assert page.locator(".control:visible").count() > 10
+
+    set_value(page, "optics.f_number", 8)
+    row = page.locator(".control[data-key='optics.f_number']")
+
+    assert "changed" in row.get_attribute("class")
+    assert page.inner_text(".section[data-section=optics] .count") == "1"
+    page.click("#only-changed")
+    assert page.locator(".control:visible").count() == 1
+    row.locator(".reset").click()
+    until(page, "() => studio.state.settings.optics.f_number === 2.8")
+    assert "changed" not in row.get_attribute("class")
 
 
 # -- history, variants, presets ----------------------------------------------------------------------------------------------
@@ -396,7 +390,7 @@ def test_hundred_steps_undo_and_redo(visit):
     assert np.array_equal(codes(page), last_codes)
 
 
-def test_variants_have_common_view_and_scale(visit):
+def test_variants_share_view_and_scale(visit):
     page = visit()
     a_codes = codes(page)
     page.click("#freeze")
@@ -418,9 +412,6 @@ def test_variants_have_common_view_and_scale(visit):
     until(page, "() => !studio.page.frozen")
     assert page.is_hidden("#map-a")
 
-
-def test_variant_is_that_of_the_server(visit):
-    page = visit()
     set_value(page, "exposure_s", 0.004)
     expected = codes(page)
     set_value(page, "exposure_s", 0.02)
@@ -476,24 +467,7 @@ def test_preset_replaces_the_layout(visit):
 # -- files ------------------------------------------------------------------------------------------------------------------
 
 
-def test_dropped_photograph_becomes_the_scene(visit):
-    from PIL import Image
-
-    page = visit()
-    before = codes(page)
-    buffer = io.BytesIO()
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)).save(buffer, "PNG")
-    drop(page, "photo.png", buffer.getvalue())
-    until(
-        page,
-        "() => /photo/.test(studio.state.settings.scene.picture) && studio.isIdle",
-    )
-
-    assert not np.array_equal(codes(page), before)
-    assert page.is_hidden("#drop")
-
-
-def test_corrupt_picture_keeps_the_state(visit):
+def test_dropped_pictures_become_the_scene(visit):
     page = visit()
     before = codes(page)
     drop(page, "photo.png", b"\x89PNG\r\n\x1a\n" + bytes(100))
@@ -506,6 +480,18 @@ def test_corrupt_picture_keeps_the_state(visit):
     assert np.array_equal(codes(page), before)
     set_value(page, "exposure_s", 0.01)
     assert page.is_hidden("#problem")
+
+    before = codes(page)
+    buffer = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)).save(buffer, "PNG")
+    drop(page, "photo.png", buffer.getvalue())
+    until(
+        page,
+        "() => /photo/.test(studio.state.settings.scene.picture) && studio.isIdle",
+    )
+
+    assert not np.array_equal(codes(page), before)
+    assert page.is_hidden("#drop")
 
 
 def test_files_of_state_are_written(visit, server):
