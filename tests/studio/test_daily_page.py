@@ -145,7 +145,7 @@ def test_curves_differ_by_more_than_hue(visit):
 # -- unknowns -----------------------------------------------------------------------------------------------------------------
 
 
-def test_number_of_photosites_is_entered(visit):
+def test_numbers_are_entered_in_fields(visit):
     page = visit()
     before = page.evaluate("studio.state.summary.n_sites")
     field(page, "layout.parameters.n_sites", "5000")
@@ -165,6 +165,15 @@ def test_number_of_photosites_is_entered(visit):
         change(page, "() => document.getElementById('undo').click()")
     assert page.evaluate("studio.state.summary.n_sites") == before
     assert solve.evaluate("select => select.selectedOptions[0].textContent") == "number of photosites"
+
+    for text, value in (("1/50", 0.02), ("20 ms", 0.02), ("0,03", 0.03), ("8*2 ms", 0.016)):
+        field(page, "exposure_s", text)
+        assert setting(page, "exposure_s") == pytest.approx(value)
+        assert float(control(page, "exposure_s").input_value()) == pytest.approx(value)
+    field(page, "layout.parameters.n_sectors", "8*8")
+    assert setting(page, "layout.parameters.n_sectors") == 64
+    field(page, "optics.f_number", "wide")
+    assert "f_number" in page.inner_text(".control[data-key='optics.f_number'] .error")
 
 
 # -- connections ---------------------------------------------------------------------------------------------------------------
@@ -357,18 +366,6 @@ def numbers(server, browser):
     until(page, "() => window.numberOf")
     yield page
     page.close()
-
-
-def test_fields_accept_written_numbers(visit):
-    page = visit()
-    for text, value in (("1/50", 0.02), ("20 ms", 0.02), ("0,03", 0.03), ("8*2 ms", 0.016)):
-        field(page, "exposure_s", text)
-        assert setting(page, "exposure_s") == pytest.approx(value)
-        assert float(control(page, "exposure_s").input_value()) == pytest.approx(value)
-    field(page, "layout.parameters.n_sectors", "8*8")
-    assert setting(page, "layout.parameters.n_sectors") == 64
-    field(page, "optics.f_number", "wide")
-    assert "f_number" in page.inner_text(".control[data-key='optics.f_number'] .error")
 
 
 def test_search_knows_other_words(visit):

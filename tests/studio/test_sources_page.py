@@ -155,11 +155,22 @@ def test_video_plays_while_gaze_moves(visit, tmp_path):
     assert setting(page, "scene.picture") == "skimage:astronaut"
 
 
-def test_every_key_counts_during_frames(visit, tmp_path):
-    """Keys and buttons continue from the frame that is wanted, not from that of the last answer."""
+def test_frames_are_archived_and_stepped_by_keys(visit, tmp_path):
     page = visit()
     drop(page, "clip.mp4", video(tmp_path))
     film(page)
+    page.evaluate("() => { studio.sources.film.go(7); }")
+    until(page, "() => studio.state.film.n === 7")
+    settle(page)
+    names = unzipped(page, tmp_path / "all")
+
+    assert {"clip_frame_7.png", "test.yaml", "test.py", "test.ipynb"} <= set(names)
+    assert np.array_equal(codes(page), codes_of(tmp_path / "all" / "test.yaml"))
+
+    # Keys and buttons continue from the frame that is wanted, not from that of the last answer.
+    page.evaluate("() => { studio.sources.film.go(0); }")
+    until(page, "() => studio.state.film.n === 0")
+    settle(page)
     hold_frames(page)
 
     def release(n):
@@ -184,20 +195,7 @@ def test_every_key_counts_during_frames(visit, tmp_path):
     assert slider.input_value() == "4"
 
 
-def test_archive_of_frame_has_same_codes(visit, tmp_path):
-    page = visit()
-    drop(page, "clip.mp4", video(tmp_path))
-    film(page)
-    page.evaluate("() => { studio.sources.film.go(7); }")
-    until(page, "() => studio.state.film.n === 7")
-    settle(page)
-    names = unzipped(page, tmp_path / "all")
-
-    assert {"clip_frame_7.png", "test.yaml", "test.py", "test.ipynb"} <= set(names)
-    assert np.array_equal(codes(page), codes_of(tmp_path / "all" / "test.yaml"))
-
-
-def test_corrupt_videos_give_one_line(visit, tmp_path):
+def test_unreadable_sources_give_one_line(visit, tmp_path):
     page = visit()
     before = codes(page)
     drop(page, "notes.mp4", b"This is a text.\n" * 50)
@@ -208,6 +206,13 @@ def test_corrupt_videos_give_one_line(visit, tmp_path):
     assert page.is_hidden("#film")
     assert np.array_equal(codes(page), before)
     assert not page.is_disabled("#freeze")
+
+    forget_messages(page)
+    start_camera(page)
+    message(page, "There is no camera|does not permit")
+
+    assert page.is_hidden("#film")
+    assert setting(page, "scene.picture") == "skimage:astronaut"
 
 
 def test_empty_and_large_files_give_one_line(visit):
@@ -381,15 +386,6 @@ def test_undo_stops_the_camera(visit_camera):
 
     assert setting(page, "scene.picture") == "skimage:astronaut"
     assert page.is_hidden("#film")
-
-
-def test_missing_camera_gives_one_line(visit):
-    page = visit()
-    start_camera(page)
-    message(page, "There is no camera|does not permit")
-
-    assert page.is_hidden("#film")
-    assert setting(page, "scene.picture") == "skimage:astronaut"
 
 
 # -- comparison ---------------------------------------------------------------------------------------------------------------
