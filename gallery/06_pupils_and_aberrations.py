@@ -31,6 +31,8 @@ LENS = {"focal_length_mm": 10.0, "f_number": 4.0}
 LIGHT = {"distance_m": DISTANCE_M, "wavelength_nm": [WAVELENGTH_NM], "band_width_nm": 10.0}
 #: Wavefront error for a Strehl ratio of about 0.8 (Marechal criterion), waves rms.
 MARECHAL_WAVES = 1.0 / 14.0
+#: Frequencies of the MTF for a test of the script.
+QUICK = {"n_frequencies": 30}
 
 
 def half_moon(x: np.ndarray, y: np.ndarray, wavelength_nm: float) -> np.ndarray:  # noqa: ARG001 -- signature of pupil functions
@@ -69,7 +71,7 @@ def enlarged(power_map: fs.PowerMap, spacing_um: float) -> np.ndarray:
     return np.block([[cells[row, column][::-1] for column in columns] for row in rows])
 
 
-def main(out_dir: Path) -> None:
+def main(out_dir: Path, n_frequencies: int = 200) -> None:
     """Write PSFs, letters and a field of points to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
     # %% PSF, image of a letter and MTF of each lens.
@@ -77,7 +79,7 @@ def main(out_dir: Path) -> None:
     letter = charts.letter_f(
         height_mm=3.0, shape=(160, 160), pitch_um=32.0, radiance_w_m2_sr_nm=0.1, contrast=1.0, **LIGHT
     )
-    per_mm = np.linspace(0.0, 460.0, 200)
+    per_mm = np.linspace(0.0, 460.0, n_frequencies)
     figure = Figure(figsize=(8.0, 9.6), layout="constrained")
     axes = figure.subplots(6, 5)
     columns = np.hstack((axes[:3], axes[3:])).T  # five lenses above, five below

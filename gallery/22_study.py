@@ -41,6 +41,8 @@ SHOT = {
     "exposure_s": 0.01,
 }
 N_TRIALS = 40
+#: Trials for a test of the script.
+QUICK = {"n_trials": 20}
 MIN_COVERED_FRACTION = 0.92
 
 
@@ -49,7 +51,7 @@ def covered_fraction(_shot: Shot, _camera: fs.Camera, capture: fs.Capture) -> fl
     return float(capture.layout.area_um2.sum()) / (np.pi * FIELD_RADIUS_UM**2)
 
 
-def main(out_dir: Path) -> None:
+def main(out_dir: Path, n_trials: int = N_TRIALS) -> None:
     """Write the study and its figure to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
     # %% Search over sectors and minimum site size; the blind spot grows with both.
@@ -62,7 +64,7 @@ def main(out_dir: Path) -> None:
         {"psnr_db": "maximize", "n_sites": "minimize"},
         constraints={"covered_fraction": (MIN_COVERED_FRACTION, None)},
         metrics={**{name: METRICS[name] for name in ("psnr_db", "n_sites")}, "covered_fraction": covered_fraction},
-        n_trials=N_TRIALS,
+        n_trials=n_trials,
         seed=1,
         storage=out_dir / "22_study.db",
     )
@@ -103,7 +105,7 @@ def main(out_dir: Path) -> None:
     for trial in front:
         settings = ", ".join(f"{path.rpartition('.')[2]} {value:.3g}" for path, value in trial.params.items())
         print(f"{trial.values[1]:7,.0f} photosites, {trial.values[0]:.1f} dB: {settings}")
-    assert len(trials) == N_TRIALS
+    assert len(trials) == n_trials
     assert 7 <= len(front) <= 14
     assert all(trial.user_attrs["covered_fraction"] >= MIN_COVERED_FRACTION for trial in front)
     assert all(np.diff([trial.values[0] for trial in front]) > 0.0)

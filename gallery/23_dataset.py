@@ -56,6 +56,8 @@ DIM = {"exposure_s": 2e-4, "sensor.capacitance_f": {"per_um2": 1e-18}, "layout":
 #: Bounding box of the face, in pixels from the upper left corner, and its class.
 FACE_PX, FACE = [170, 50, 280, 200], 1
 N_CAMERAS, N_DRAWS = 8, 4
+#: Cameras of the first dataset for a test of the script.
+QUICK = {"n_cameras": 4}
 #: Side of the pictures in pixels, and the grey level of regions without photosites.
 PICTURE_PIXELS, GREY = 300, 60.0
 
@@ -68,7 +70,7 @@ def picture_on_grey(capture: Capture, white_dn: float | None = None) -> NDArray[
     return np.rint(image[..., :-1] * cover + GREY * (1.0 - cover)).astype(np.uint8)
 
 
-def main(out_dir: Path) -> None:
+def main(out_dir: Path, n_cameras: int = N_CAMERAS) -> None:
     """Write samples of both datasets to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
     photograph = skimage.data.astronaut()
@@ -78,14 +80,14 @@ def main(out_dir: Path) -> None:
         [photograph],
         SHOT,
         {"layout": {"choice": LAYOUTS}, "sensor.bits": {"choice": [6, 8, 10]}},
-        cameras=N_CAMERAS,
+        cameras=n_cameras,
         seed=5,
         labels=["astronaut"],
         boxes=[[[*FACE_PX, FACE]]],
         fit="cover",
     )
     figure = Figure(figsize=(8.0, 10.0), layout="constrained")
-    for k, axes in enumerate(figure.subplots(N_CAMERAS // 2, 2).ravel()):
+    for k, axes in enumerate(figure.subplots(n_cameras // 2, 2).ravel()):
         sample, capture = data[k], data.capture(k)
         x0, y0, x1, y1 = capture.layout.bounds_um
         axes.imshow(picture_on_grey(capture), extent=(x0, x1, y0, y1))

@@ -56,6 +56,8 @@ FOVEA_RADIUS_UM = 56.0
 LARGE_GRID_SITES = tuple(int(n) for n in np.geomspace(150, 7800, 12))
 LARGE_FOVEAL = tuple((n, size) for n in (16, 32, 48, 64, 80, 100) for size in (5.0, 7.0, 10.0, 14.0) if n * size < 900)
 LARGE_DRAWS = 3
+#: Photographs for a test of the script.
+QUICK = {"n_views": 2}
 COLOURS = {"uniform grid": "tab:blue", "foveal": "tab:red"}
 
 
@@ -339,11 +341,11 @@ def show_task(axes: Axes, results: dict[str, list[MotionErrors]], task: Task) ->
     axes.set_axisbelow(True)
 
 
-def main(out_dir: Path, *, is_large: bool = False) -> None:
+def main(out_dir: Path, *, is_large: bool = False, n_views: int = len(GAZES)) -> None:
     """Write a figure of motion errors and of two sensors to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
     # %% Motion errors of all sensors.
-    views = [view_of(name) for name in GAZES]
+    views = [view_of(name) for name in list(GAZES)[:n_views]]
     results = [family_errors(views, task, is_large=is_large) for task in TASKS]
 
     # %% Figure.

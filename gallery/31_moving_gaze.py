@@ -28,8 +28,8 @@ N_MOVING, N_RESTING = 4, 1
 FRAME_MS, REST_MS = 160, 700
 N_PIXELS = 640
 RING_UM = 150.0
-#: Frames for a test of the script.
-QUICK = {"n_stops": 2, "n_moving": 1}
+#: Frames and pixels for a test of the script.
+QUICK = {"n_stops": 2, "n_moving": 1, "step": 2}
 
 
 def gaze_path(n_stops: int, n_moving: int) -> tuple[np.ndarray, list[int]]:
@@ -63,11 +63,11 @@ def frame(scene: fs.Scene, gaze_um: np.ndarray, exposure_s: float, seed: int) ->
     return image, layout.n_sites, n_near
 
 
-def main(out_dir: Path, n_stops: int = len(STOPS), n_moving: int = N_MOVING) -> None:
+def main(out_dir: Path, n_stops: int = len(STOPS), n_moving: int = N_MOVING, step: int = 1) -> None:
     """Write the animation to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
     # %% Scene and exposure are fixed; each gaze has its own photosites.
-    scene = first.photograph()
+    scene = first.photograph(step)
     gazes_um, durations_ms = gaze_path(n_stops, n_moving)
     exposure_s = first.three_chips(first.foveal_layout(tuple(gazes_um[0]))).auto_exposure(scene)
     frames, counts, near = zip(

@@ -48,8 +48,8 @@ LENS = fs.Optics(focal_length_mm=50.0, f_number=5.0, padding="edge", oversample=
 DISTANCE_M = 10.0
 HEIGHTS_MM = (0.0, 8.0, 15.0)
 N_MODES = (2, 6, 16)
-#: Frames, pixels and wavelengths for a test of the script.
-QUICK = {"n_frames": 1, "n_pixels": 256, "waves_nm": (550.0,)}
+#: Frames, pixels, wavelengths and samples of a PSF for a test of the script.
+QUICK = {"n_frames": 1, "n_pixels": 256, "waves_nm": (550.0,), "n_samples": 121}
 
 
 def index_of(glass: str, wave_um: float) -> float:
@@ -104,10 +104,10 @@ def beam(angle_rad: float, wave_um: float) -> tuple[np.ndarray, np.ndarray, np.n
     return at[fills], ray[fills], path[fills]
 
 
-def psf_of(angle_rad: float, wave_um: float) -> tuple[np.ndarray, float, float]:
+def psf_of(angle_rad: float, wave_um: float, n_samples: int) -> tuple[np.ndarray, float, float]:
     """Return the PSF around the chief ray, its image height in mm, and the projected solid angle of the beam."""
     at, ray, path = beam(angle_rad, wave_um)
-    offsets_mm = 1e-3 * PITCH_UM * (np.arange(N_SAMPLES) - N_SAMPLES // 2)
+    offsets_mm = 1e-3 * PITCH_UM * (np.arange(n_samples) - n_samples // 2)
     # Each ray is a plane wave, with the phase of its path at the chief ray's image point.
     k_per_mm = 2e3 * np.pi / wave_um
     phase = k_per_mm * (path - np.sum(ray[:, :2] * (at - at[0])[:, :2], axis=1))
@@ -116,9 +116,9 @@ def psf_of(angle_rad: float, wave_um: float) -> tuple[np.ndarray, float, float]:
     return np.abs(amplitude) ** 2, float(at[0, 1]), float(ConvexHull(ray[:, :2]).volume)
 
 
-def triplet(waves_nm: tuple[float, ...]) -> fs.optics.PSFGrid:
+def triplet(waves_nm: tuple[float, ...], n_samples: int) -> fs.optics.PSFGrid:
     """Return the PSFs of the triplet on one radius, as a design program exports them."""
-    found = [[psf_of(angle, 1e-3 * wave_nm) for wave_nm in waves_nm] for angle in np.radians(ANGLES_DEG)]
+    found = [[psf_of(angle, 1e-3 * wave_nm, n_samples) for wave_nm in waves_nm] for angle in np.radians(ANGLES_DEG)]
     return fs.optics.PSFGrid.from_arrays(
         [[psf for psf, _, _ in each] for each in found],
         x_um=np.zeros(len(found)),
@@ -152,11 +152,17 @@ def star(n: int, n_spokes: int = 24) -> np.ndarray:
     return np.where(np.hypot(x, y) < 0.45 * n, spokes, 0.5)
 
 
-def main(out_dir: Path, n_frames: int = 4, n_pixels: int = 512, waves_nm: tuple[float, ...] = WAVES_NM) -> None:
+def main(
+    out_dir: Path,
+    n_frames: int = 4,
+    n_pixels: int = 512,
+    waves_nm: tuple[float, ...] = WAVES_NM,
+    n_samples: int = N_SAMPLES,
+) -> None:
     """Write the figure to a directory; times are the shortest of ``n_frames``."""
     out_dir.mkdir(parents=True, exist_ok=True)
     # %% PSFs of the design, and the image of a star at three heights.
-    psfs = triplet(waves_nm)
+    psfs = triplet(waves_nm, n_samples)
     lens = replace(LENS, psfs=psfs, field_tolerance=0.03)
     near = replace(lens, field_patches=1)  # the PSF at the centre of each star
     stars = [scene_of(star(160), 3.0, 1e3 * height_mm, np.array(waves_nm)) for height_mm in HEIGHTS_MM]
@@ -219,7 +225,7 @@ def main(out_dir: Path, n_frames: int = 4, n_pixels: int = 512, waves_nm: tuple[
     save_figure(figure, out_dir / "34_lens_design.png", dpi=140)
 
     # %% Check: focal length, sharpness on the axis, blur and less light off it, and convergence of the modes.
-    near_um, angle = psf_of(np.radians(0.1), 0.55)[1] * 1e3, np.radians(0.1)
+    near_um, angle = psf_of(np.radians(0.1), 0.55, n_samples)[1] * 1e3, np.radians(0.1)
     assert abs(near_um / np.tan(angle) - 50000.0) < 300.0
     strehl = [lens.strehl(550.0, distance_m=DISTANCE_M, field_um=(0.0, 1e3 * h)) for h in HEIGHTS_MM]
     assert strehl[0] > 2.0 * strehl[2]
