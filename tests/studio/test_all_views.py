@@ -197,37 +197,45 @@ def test_wrong_view_leaves_others(visit, monkeypatch, script, make, message):
     until(page, "() => studio.views.made.snr?.chart.curves.length > 0")
 
 
+#: Wrong modules of views, the problem of each, and a correct one.
+WRONG = {
+    "canvas": ("root.append('a note', document.createElement('canvas')); return {};", "empty canvases"),
+    "undefined": ("return { use: ({ about }) => root.append(make('p', about.m + ' s')) };", "shows undefined"),
+    "nan": ("return { use: () => root.append(make('p', 0 / 0)) };", "shows NaN"),
+    "same": ("const p = make('p'); root.append(p); return { use: ({ about }) => { p.textContent ||= about.n; } };", "other data, same content"),
+    "correct": ("const p = make('p'); root.append(p); return { use: ({ about }) => { p.textContent = about.n; } };", None),
+    "constant": ("return { use: ({ about }) => root.append(make('p', about.constant)) };", "same data"),
+}  # fmt: skip
+
+
 @pytest.mark.slow
 @pytest.mark.needs("chromium")
-@pytest.mark.parametrize(
-    ("script", "problem"),
-    [
-        ("root.append('a note', document.createElement('canvas')); return {};", "empty canvases"),
-        ("return { use: ({ about }) => root.append(make('p', about.m + ' s')) };", "shows undefined"),
-        ("return { use: () => root.append(make('p', 0 / 0)) };", "shows NaN"),
-        ("const p = make('p'); root.append(p); return { use: ({ about }) => { p.textContent ||= about.n; } };", "other data, same content"),
-        ("const p = make('p'); root.append(p); return { use: ({ about }) => { p.textContent = about.n; } };", None),
-        ("return { use: ({ about }) => root.append(make('p', about.constant)) };", "same data"),
-    ],
-    ids=["canvas", "undefined", "not a number", "same", "correct", "constant"],
-)  # fmt: skip
-def test_wrong_content_of_tiles_is_found(visit, monkeypatch, script, problem):
-    def make(result):
-        return {"constant": 1} if problem == "same data" else {"n": result.shot.exposure_s}, {}
+def test_wrong_content_of_tiles_is_found(visit, monkeypatch):
+    def with_exposure(result):
+        return {"n": result.shot.exposure_s}, {}
 
-    part = Part("wrong", "Wrong", make, capture_of)
-    monkeypatch.setitem(PARTS, "wrong", part)
-    module = f"import {{ make }} from '/web/page_parts.js'; export function create(root) {{ {script} }}"
+    for name in WRONG:
+        make = (lambda _: ({"constant": 1}, {})) if name == "constant" else with_exposure
+        monkeypatch.setitem(PARTS, name, Part(name, "Wrong", make, capture_of))
     page = visit()
-    page.route("**/views/wrong.js", lambda route: route.fulfill(body=module, content_type="text/javascript"))
-    page.evaluate("() => studio.views.show('wrong', true)")
-    until(page, "() => studio.isIdle && studio.views.parts.wrong && studio.views.made.wrong")
+
+    def answer(route):
+        script, _ = WRONG[re.search(r"(\w+)\.js", route.request.url)[1]]
+        module = f"import {{ make }} from '/web/page_parts.js'; export function create(root) {{ {script} }}"
+        route.fulfill(body=module, content_type="text/javascript")
+
+    for name in WRONG:
+        page.route(f"**/views/{name}.js", answer)
+        page.evaluate("name => studio.views.show(name, true)", name)
+    until(page, "names => names.every((name) => studio.views.parts[name] && studio.views.made[name])", list(WRONG))
     settle(page)
     before = page.evaluate(TILES)
     set_value(page, "exposure_s", 0.03)
-    settle(page)
+    after = page.evaluate(TILES)
 
-    assert problem_of_tile(before["wrong"], page.evaluate(TILES)["wrong"]) == problem
+    assert {name: problem_of_tile(before[name], after[name]) for name in WRONG} == {
+        name: problem for name, (_, problem) in WRONG.items()
+    }
 
 
 @pytest.mark.needs("chromium")
