@@ -66,7 +66,7 @@ test-torch: $(TORCH_VENV)/.installed
 	FOVEASIM_TESTS=$(EFFORT) FOVEASIM_TESTS_NEED=torch,deepinv,torchvision $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) tests/test_docs.py \
 		tests/test_doctests.py tests/test_gallery.py tests/test_notebooks.py tests/installation -k "torch or learn or adapters" $(PYTEST_ARGS)
 
-# Kills workers at random for some minutes: every item must be computed, at most twice.
+# Kills workers at random for some minutes: every item must be computed, or have lost its worker three times.
 soak: $(VENV)/.installed-dev
 	FOVEASIM_SOAK_ROUNDS=20 $(BIN)/python -m pytest tests/explore/test_executor.py -k lost --verbose $(PYTEST_ARGS)
 

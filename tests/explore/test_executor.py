@@ -96,10 +96,13 @@ def test_no_item_is_lost_with_workers(seed, tmp_path):
         is_complete.set()
 
     assert sorted(item for item, _ in results) == list(range(N_ITEMS))
-    assert all(result == item**2 for item, result in results)
+    # An item is given up after three ends of its worker, the last of which concerns it alone.
+    given_up = [item for item, result in results if result is KILLED]
+    assert all(result == item**2 for item, result in results if item not in given_up)
+    assert len(given_up) <= max(n_kills[0] - (module.MAX_DEATHS - 1), 0)
     assert n_kills[0] > 0
     done = [int(item) for kind, item, _ in lines(log) if kind == "done"]
-    assert max(map(done.count, range(N_ITEMS))) <= 2
+    assert max(map(done.count, range(N_ITEMS))) <= module.MAX_DEATHS
 
 
 class SimulatedClient:
