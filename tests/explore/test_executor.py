@@ -84,7 +84,8 @@ def test_no_item_is_lost_with_workers(seed, tmp_path):
     def compute():
         try:
             with executor(logging_function(log), what="the function", workers=N_WORKERS) as run:
-                found.set_result(list(run(range(N_ITEMS), range(0, N_ITEMS, 50))))
+                results = list(run(range(N_ITEMS), range(0, N_ITEMS, 50)))
+            found.set_result(results)
         except BaseException as error:  # noqa: BLE001 -- raised again by the future
             found.set_exception(error)
 
