@@ -141,6 +141,11 @@ class Summary:
         return Group(facts, sizes)
 
 
+def hull_area_um2(layout: Layout) -> float:
+    """Return the area of the convex hull of all photosites."""
+    return float(shapely.LineString(layout.xy_um).convex_hull.area)
+
+
 def describe(layout: Layout, readout: Readout | None = None) -> Summary:
     """
     Summarise a layout: counts, sizes, areas, channels and readout lines.
@@ -168,7 +173,6 @@ def describe(layout: Layout, readout: Readout | None = None) -> Summary:
     Summary(400 photosites of 2.792 µm on 61.5 x 52.8275 µm, from hexagonal)
     """
     bounds_um = layout.bounds_um
-    hull_um2 = float(shapely.LineString(layout.xy_um).convex_hull.area)
     size_um = layout.size_um
     edges_um = _size_edges_um(float(size_um.min()), float(size_um.max()))
     channel, counts = np.unique(layout.channel, return_counts=True)
@@ -177,7 +181,7 @@ def describe(layout: Layout, readout: Readout | None = None) -> Summary:
         n_vertices=len(layout.xy_um),
         bounds_um=bounds_um,
         area_um2=float(layout.area_um2.sum()),
-        fill_factor=float(layout.area_um2.sum()) / hull_um2,
+        fill_factor=float(layout.area_um2.sum()) / hull_area_um2(layout),
         size_um=np.quantile(size_um, [0.0, 0.25, 0.5, 0.75, 1.0]),
         size_edges_um=edges_um,
         size_counts=np.histogram(size_um, edges_um)[0],

@@ -28,7 +28,8 @@ PSF_POINTS, PSF_LAMBDA_N = 257, 0.125
 POINT_ACROSS = 384
 #: The same for the OTF of an aperture that cannot be integrated.
 OTF_ACROSS = 768
-#: Radial and angular quadratures of the ensquared energy: minimum number of nodes, and additional nodes per λN of the side.
+#: Radial and angular quadratures of the ensquared energy: minimum number of nodes, additional ones per λN of the
+#: side, and of which the number is a multiple, so that sides share nodes.
 QUADRATURE_NODES, NODES_PER_LAMBDA_N, NODES_STEP = 64, 8, 32
 #: Side (λN) above which the asymptotic PSF gives the ensquared energy to 1e-5.
 MIN_ASYMPTOTIC_SIDE = 100.0

@@ -39,6 +39,7 @@ from foveasim.capture import Capture
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout import Layout, inset
 from foveasim.layout._regions import as_region
+from foveasim.layout.summary import hull_area_um2
 from foveasim.view.meshes import DEGENERATE_FRACTION, Mesh, extrude, import_pyvista, triangulate
 from foveasim.view.site_colours import colours_of
 
@@ -215,8 +216,7 @@ class Solids:
         Without trenches this is the fill factor of the layout, as in :func:`foveasim.layout.describe`; with trenches, that of
         ``inset(layout, trench_width_um / 2)`` on the same hull.
         """
-        hull_um2 = float(shapely.LineString(self.layout.xy_um).convex_hull.area)
-        return float(self.volumes_um3("wells").sum()) / (hull_um2 * self.sensor_stack.well_depth_um)
+        return float(self.volumes_um3("wells").sum()) / (hull_area_um2(self.layout) * self.sensor_stack.well_depth_um)
 
     def check(self) -> SolidsReport:
         """
