@@ -44,6 +44,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_demo_writes_pictures_and_table(foveasim, tmp_path):
     result = foveasim("demo", "-o", "out", cwd=tmp_path)
 
@@ -159,11 +160,18 @@ source: made for this test
 """
 
 
-def test_exit_code_reports_rule_violations(foveasim, tmp_path):
-    """That of the program as users run it, in a process of its own."""
+@pytest.fixture
+def anywhere(request):
+    """Return a function that runs the program in this process, or in one of its own as users do."""
+    return run_program if request.param == "program" else request.getfixturevalue("foveasim")
+
+
+@pytest.mark.slow(keep=("here",))
+@pytest.mark.parametrize("anywhere", ["here", "program"], indirect=True)
+def test_exit_code_reports_rule_violations(anywhere, foveasim, tmp_path):
     (tmp_path / "rings.yaml").write_text(LAYOUT)
     (tmp_path / "loose.yaml").write_text("min_size_um: 0.1\n")
-    broken = run_program("check", "rings.yaml", "--report", "rings.lyrdb", cwd=tmp_path)
+    broken = anywhere("check", "rings.yaml", "--report", "rings.lyrdb", cwd=tmp_path)
     kept = foveasim("check", "rings.yaml", "--rules", "loose.yaml", cwd=tmp_path)
 
     assert broken.returncode == 1

@@ -187,7 +187,7 @@ config.bundled_layouts = lambda: few
 """
 
 
-@pytest.mark.slow(keep=("texts",))
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ON_ASCII)
 def test_ascii_terminals_get_plain_characters(tmp_path, kind):
     rings = {"generator": "log_polar", "parameters": {"n_sectors": 16, "r_min_um": 2.0, "r_max_um": 20.0}}

@@ -134,6 +134,7 @@ def test_page_over_directory_is_rejected(view, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["out.html"]
 
 
+@pytest.mark.slow
 def test_page_is_served_on_localhost(view, folder):
     command = [sys.executable, "-m", "foveasim.cli", "view", "layout.npz", "--serve"]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
@@ -193,8 +194,8 @@ _serve.serve_page("x" * {BIG_BYTES}, announce=lambda address: print(address, flu
 """
 
 
-@pytest.fixture
-def serve():
+@contextlib.contextmanager
+def servers_in_processes():
     """Start servers in separate processes; each exits with 0 on Ctrl-C and prints nothing."""
     servers = []
 
@@ -217,6 +218,19 @@ def serve():
     assert endings == [("", "", 0)] * len(servers)
 
 
+@pytest.fixture
+def serve():
+    with servers_in_processes() as start:
+        yield start
+
+
+@pytest.fixture(scope="module")
+def served_port():
+    """Return the port of one server for several tests."""
+    with servers_in_processes() as start:
+        yield start()[0]
+
+
 def connect(port, text="", host="127.0.0.1"):
     connection = socket.create_connection((host, port), timeout=DEADLINE_S)
     connection.sendall(text.encode())
@@ -229,8 +243,8 @@ def ask(port, host=None, first="GET / HTTP/1.1", more=""):
         return b"".join(iter(lambda: connection.recv(1 << 16), b""))
 
 
-def test_served_page_survives_clients_that_reset(serve):
-    port, _ = serve()
+def test_served_page_survives_clients_that_reset(served_port):
+    port = served_port
     for n_bytes in (0, 1, 100_000):
         for _ in range(5):
             connection = connect(port, f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n")
@@ -300,21 +314,19 @@ REQUESTS = [
 ]
 
 
-def test_served_page_answers_one_request_alone(serve):
-    port, _ = serve()
+def test_served_page_answers_one_request_alone(served_port):
     for request, status in REQUESTS:
-        answer = ask(port, **request)
+        answer = ask(served_port, **request)
         assert answer.split(b" ", 2)[1] == status, request
         assert len(answer) < 1000
-    assert ask(port, f"LOCALHOST:{port}").startswith(b"HTTP/1.1 200")
+    assert ask(served_port, f"LOCALHOST:{served_port}").startswith(b"HTTP/1.1 200")
 
 
 @on_linux
-def test_served_page_listens_on_one_address(serve):
-    port, _ = serve()
+def test_served_page_listens_on_one_address(served_port):
     # 127.0.0.0/8 is this machine: a server on all addresses would answer.
     with pytest.raises(ConnectionRefusedError):
-        connect(port, host="127.0.0.2")
+        connect(served_port, host="127.0.0.2")
 
 
 def test_ctrl_c_ends_busy_server(serve):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from functools import partial
 
 import numpy as np
 import pytest
+from cli.conftest import run_here
 
 import foveasim as fs
 from foveasim.config import read_any_layout, read_shot
@@ -22,6 +22,12 @@ exposure_s: 0.01
 
 
 @pytest.fixture
+def command(monkeypatch, capsys):
+    """Return a function that runs the program in this process."""
+    return partial(run_here, monkeypatch, capsys.readouterr)
+
+
+@pytest.fixture
 def two_sites():
     return fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0)
 
@@ -30,12 +36,6 @@ def write_as(layout, path):
     """A layout in a file whose name has no extension."""
     layout.write(path.with_suffix(".npz"))
     path.with_suffix(".npz").rename(path)
-
-
-def command(*arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-m", "foveasim.cli", *arguments], cwd=cwd, capture_output=True, text=True, check=False
-    )
 
 
 @pytest.mark.parametrize("name", ["giotto_2", "prima_75"])
@@ -59,7 +59,7 @@ def test_read_layout_reads_files_of_any_format(tmp_path, two_sites):
         fs.read_layout("giotto_2", cell="TOP")
 
 
-def test_files_precede_bundled_names(tmp_path, monkeypatch, two_sites):
+def test_files_precede_bundled_names(command, tmp_path, monkeypatch, two_sites):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "giotto_1").mkdir()
     write_as(two_sites, tmp_path / "prima_100")
@@ -90,7 +90,6 @@ def test_read_layout_suggests_bundled_names(tmp_path, monkeypatch):
         fs.layout.read_layout("giotto_2")
 
 
-@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("name", "words"),
     [
@@ -104,7 +103,7 @@ def test_read_layout_suggests_bundled_names(tmp_path, monkeypatch):
         ("nowhere.gds", "nowhere.gds: no such file"),
     ],
 )
-def test_unknown_names_are_rejected_with_the_closest(name, words, tmp_path, monkeypatch):
+def test_unknown_names_are_rejected_with_the_closest(command, name, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(FileError) as caught:
         fs.read_layout(name)

@@ -123,6 +123,7 @@ def test_source_of_sections_gives_same_codes(settings):
     assert np.array_equal(codes_of_python(text), codes_of_settings(settings))
 
 
+@pytest.mark.slow
 def test_source_runs_in_new_process():
     settings = changed(scene=read_settings(demo_settings()[0])["scene"], scene__pitch_um=20.0)
     script = to_python(settings) + "\nprint(capture.code.sum())"

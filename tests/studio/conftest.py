@@ -28,10 +28,18 @@ SETTINGS = {
 }  # fmt: skip
 
 
-class Recorder:
-    """A session whose messages are handled at once, and its answers."""
+#: Views of the page in most tests.
+FEW_VIEWS = ("sites", "columns", "picture", "comparison")
+#: Marks tests with the views of a new page.
+ALL_VIEWS = pytest.mark.parametrize("views", [None], ids=["all views"])
 
-    def __init__(self, session):
+
+class Recorder:
+    """A session whose messages are handled at once, and its answers; ``views``: those of the page, None for those of a new one."""
+
+    def __init__(self, session, views=FEW_VIEWS):
+        if views is not None:
+            session._views.select(list(views))
         self.session = session
         self.messages, self.parts = [], []
         session._listeners[self._receive] = False
@@ -69,13 +77,18 @@ def settings():
 
 
 @pytest.fixture
-def make_session(settings, monkeypatch):
+def views():
+    return FEW_VIEWS
+
+
+@pytest.fixture
+def make_session(settings, views, monkeypatch):
     monkeypatch.setattr(_session, "PROGRESS_S", -1.0)  # all stages
     made = []
 
     def make(out=None, directory=None, start=None):
         made.append(WithoutThread("test", Start(start or settings, "small", directory, out), n_threads=1))
-        return Recorder(made[-1])
+        return Recorder(made[-1], views)
 
     yield make
     for session in made:

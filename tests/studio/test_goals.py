@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from studio.conftest import ALL_VIEWS
 from studio.test_session import codes_of
 
 from foveasim.config import build_shot
@@ -12,6 +13,7 @@ def rows(recorder):
     return next(header["about"]["rows"] for header, _ in reversed(recorder.parts) if header["part"] == "requirements")
 
 
+@ALL_VIEWS
 def test_requirements_follow_the_settings(recorder):
     limits = [{"measure": "n_sites", "at_least": 300}, {"measure": "snr", "at_least": 1e9, "site": 500}]
     state = recorder.do(do="set", key="requirements", value=limits, id=1)
@@ -107,6 +109,7 @@ def curves(recorder, name):
     ]
 
 
+@ALL_VIEWS
 def test_pinned_photosites_have_their_curves(recorder):
     recorder.do(do="pin", sites=[3, 200, 3], id=1)
     assert curves(recorder, "snr") == curves(recorder, "photon_transfer") == ["photosite 3", "photosite 200"]

@@ -8,6 +8,7 @@ import threading
 import numpy as np
 import pytest
 from PIL import Image
+from studio.conftest import ALL_VIEWS
 from waiting import DEADLINE_S, wait_until
 
 from foveasim.config import build_shot
@@ -89,6 +90,7 @@ def test_scenes_with_fit_are_reduced(large, tmp_path):
 # -- sessions ---------------------------------------------------------------------------------------------------------------
 
 
+@ALL_VIEWS
 def test_final_codes_after_previews_are_exact(large, make_session):
     recorder = make_session(start=large)
     for state in drag(recorder, 3.0, 3.5, 4.0):

@@ -23,6 +23,7 @@ COMA = {"coma_um": 0.2, "field_radius_um": 200.0}
 def simulate(settings):
     def simulate(pinned=(), **optics):
         changed = json.loads(json.dumps(settings))
+        changed["scene"] |= {"shape": [16, 16], "pitch_um": 2000.0, "wavelength_nm": 550.0}
         changed["optics"] |= optics
         return replace(Engine(n_threads=1).simulate(changed), pinned=tuple(pinned))
 

@@ -500,6 +500,7 @@ class Program:
         return self.process.returncode, errors
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_signals_delete_uploaded_files(name, tmp_path):
     """Also those of a session with an open page; the exit code is that of the signal."""
@@ -526,6 +527,7 @@ def test_signals_delete_uploaded_files(name, tmp_path):
     assert list(tmp_path.rglob("*")) == []
 
 
+@pytest.mark.slow
 def test_printed_addresses_answer():
     """At all addresses of this computer, with the address as host, and with no other one."""
     program = Program("--host", "0.0.0.0", n_lines=1 + len([each for each in other_addresses() if ":" not in each]))

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from studio.conftest import ALL_VIEWS
 from typer.testing import CliRunner
 from waiting import DEADLINE_S, wait_until
 
@@ -41,6 +42,7 @@ def code_part(recorder):
     return arrays[column["array"]]
 
 
+@ALL_VIEWS
 def test_first_connection_receives_all_parts(recorder):
     assert recorder.part_names[:2] == ["sites", "columns"]
     parts = _session.PARTS.values()
@@ -421,6 +423,7 @@ def fail(*_):
     raise RuntimeError("two\nlines")
 
 
+@ALL_VIEWS
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
@@ -555,6 +558,7 @@ def groups_of(recorder):
     return [(header["part"], header.get("has_more", False)) for header, _ in recorder.parts]
 
 
+@ALL_VIEWS
 def test_fast_parts_are_shown_in_one_frame(recorder, monkeypatch):
     monkeypatch.setattr(_views, "TOGETHER_S", 60.0)
     monkeypatch.setattr(_views, "SOON_S", 60.0)
@@ -568,6 +572,7 @@ def test_fast_parts_are_shown_in_one_frame(recorder, monkeypatch):
     assert recorder.messages[-1]["kind"] == "done"
 
 
+@ALL_VIEWS
 def test_sites_are_shown_before_slow_parts(recorder, monkeypatch):
     monkeypatch.setattr(_views, "TOGETHER_S", 60.0)
     key = "layout.parameters.pitch_um"
@@ -580,6 +585,7 @@ def test_sites_are_shown_before_slow_parts(recorder, monkeypatch):
     assert all(has_more for _, has_more in groups[2:])
 
 
+@ALL_VIEWS
 def test_late_parts_are_shown_at_once(recorder, monkeypatch):
     monkeypatch.setattr(_views, "TOGETHER_S", 0.0)
     recorder.do(do="set", key="optics.f_number", value=4.0, final=True)
