@@ -9,6 +9,7 @@ examples. Runs of named files and directories, and those with FOVEASIM_TESTS=all
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -81,6 +82,17 @@ def pytest_configure(config):
     hypothesis.settings.load_profile("foveasim")
     if not is_worker and getattr(config.option, "numprocesses", None):
         compile_kernels()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Collect without garbage collections, and leave modules and tests out of all later ones: nothing of them is released."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def needs(item):

@@ -12,5 +12,7 @@ class LazyModule:
         self._name = name
 
     def __getattr__(self, attribute: str) -> object:
-        """Return an attribute of the module."""
+        """Return a public attribute of the module; pytest looks for attributes of its own in all objects of test modules."""
+        if attribute.startswith("_"):
+            raise AttributeError(attribute)
         return getattr(pytest.importorskip(self._name), attribute)

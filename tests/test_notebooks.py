@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 
 import pytest
+from lazy_modules import LazyModule
 
-nbformat = pytest.importorskip("nbformat")
-nbclient = pytest.importorskip("nbclient")
+nbformat, nbclient = LazyModule("nbformat"), LazyModule("nbclient")
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
@@ -22,7 +22,7 @@ def stems(paths):
     return [pytest.param(path, marks=NEEDS.get(path.stem, []), id=path.stem) for path in paths]
 
 
-@pytest.mark.slow(keep=("photon_transfer",))
+@pytest.mark.slow
 @pytest.mark.parametrize("path", stems(NOTEBOOKS))
 def test_notebook_runs_and_shows_results(path, tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")

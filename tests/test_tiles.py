@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from lazy_modules import LazyModule
 
 import foveasim as fs
 from foveasim import tiles
@@ -17,7 +18,7 @@ from foveasim.sensor import effects
 from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, FixedOffset
 from foveasim.video import partial_path
 
-zarr = pytest.importorskip("zarr")
+zarr = LazyModule("zarr")
 
 BLOCK = 1 << 16
 OPTICS = fs.Optics(focal_length_mm=8.0, f_number=4.0)

@@ -315,13 +315,17 @@ def test_stored_settings_are_exact(name, vary, tmp_path):
 
 GRID = fs.Grid.centred((11, 13), 4.0)
 LENS = fs.distortion.BrownConrady(focal_um=60.0, k1=-0.25, p1=0.01, centre_um=(1.5, -2.0))
-#: Sites of irregular shapes, some of them partly outside the picture.
-SITES = fs.layout.voronoi(n_sites=40, size_um=(56.0, 46.0), seed=2)
 
 
-def intersection_um2(lens):
+@pytest.fixture(scope="module")
+def sites():
+    """Return sites of irregular shapes, some of them partly outside the picture."""
+    return fs.layout.voronoi(n_sites=40, size_um=(56.0, 46.0), seed=2)
+
+
+def intersection_um2(sites, lens):
     """Compute the intersection area of each site and cell, (n_site, n_y, n_x), and the outlines, by shapely."""
-    outlines = SITES.polygons()
+    outlines = sites.polygons()
     if lens is not None:
         outlines = shapely.segmentize(outlines, 0.02)
         outlines = shapely.transform(outlines, lens.undistort)
@@ -331,9 +335,9 @@ def intersection_um2(lens):
 
 
 @pytest.fixture(scope="module", params=[None, LENS], ids=["undistorted", "distorted"])
-def reference(request):
-    areas_um2, outlines = intersection_um2(request.param)
-    return request.param, fs.Integrator(SITES, GRID, distortion=request.param), areas_um2, outlines
+def reference(request, sites):
+    areas_um2, outlines = intersection_um2(sites, request.param)
+    return request.param, fs.Integrator(sites, GRID, distortion=request.param), areas_um2, outlines
 
 
 def test_site_mask_is_class_with_largest_area(reference):
@@ -372,11 +376,11 @@ def test_box_covers_sites_mostly_inside(reference, box_px):
     np.testing.assert_allclose(found.box_um[0], [*real.min(axis=0), *real.max(axis=0)], atol=0.02)
 
 
-def test_box_outside_image_circle_is_empty():
+def test_box_outside_image_circle_is_empty(sites):
     far = fs.Grid.centred((100, 100), 4.0)
     found = boxes_on_sites(
         np.array([[0.0, 0.0, 5.0, 5.0], [48.0, 48.0, 52.0, 52.0]]),
-        fs.Integrator(SITES, far, distortion=LENS),
+        fs.Integrator(sites, far, distortion=LENS),
         LENS,
     )
 

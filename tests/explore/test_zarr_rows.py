@@ -6,10 +6,11 @@ import json
 
 import numpy as np
 import pytest
+from lazy_modules import LazyModule
 
 from foveasim.explore.datasets.zarr_rows import CHUNK_BYTES, RowReader, create_rows, rows_per_chunk
 
-zarr = pytest.importorskip("zarr")
+zarr = LazyModule("zarr")
 
 N = 11
 

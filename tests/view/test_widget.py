@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import sys
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ import foveasim as fs
 from foveasim.errors import ParameterError
 from foveasim.view.web import web_page
 
-pytest.importorskip("anywidget")
+pytestmark = pytest.mark.skipif(find_spec("anywidget") is None, reason="no anywidget")
 
 LAYOUT = fs.layout.grid(n_x=12, n_y=8, pitch_um=5.0).with_columns(gain=np.arange(96) / 96)
 #: Model of a notebook's front end, which sends the changes of the page to Python.
