@@ -48,6 +48,7 @@ def measured(module_of):
     return measure
 
 
+@pytest.mark.slow
 def test_rows_within_bounds_are_measured_once(measured):
     report, left = measured([1.5, 1.0])
 
@@ -56,6 +57,7 @@ def test_rows_within_bounds_are_measured_once(measured):
     assert "measured again: no row" in report.summary()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("figures", "expected", "n_missed"), [((3.0, 1.5), 1.5, 0), ((3.0, 4.0), 3.0, 1)])
 def test_missed_rows_keep_better_figure(measured, figures, expected, n_missed):
     report, _ = measured(figures)

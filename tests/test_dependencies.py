@@ -136,6 +136,7 @@ def undeclared_imports(path, extras):
     return {name for name, found in imported_distributions(path) if not found & allowed(extras)}
 
 
+@pytest.mark.slow
 def test_imports_of_package_are_declared():
     parts = {path: path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in sorted(PACKAGE.rglob("*.py"))}
     found = {path: undeclared_imports(path, EXTRAS.get(part, set())) for path, part in parts.items()}
@@ -144,6 +145,7 @@ def test_imports_of_package_are_declared():
     assert {str(path): names for path, names in found.items() if names} == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_imports_of_folders_are_declared(folder):
     paths = sorted(set((ROOT / folder).rglob("*.py")) - OPTIONAL_TESTS)

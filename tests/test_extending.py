@@ -85,6 +85,7 @@ def extended(tmp_path_factory):
     )
 
 
+@pytest.mark.slow
 def test_installed_package_extends_every_kind(extended):
     assert extended.returncode == 0, extended.stderr
     assert json.loads(extended.stdout) == {
@@ -104,6 +105,7 @@ def test_installed_package_extends_every_kind(extended):
     }
 
 
+@pytest.mark.slow
 def test_broken_entry_point_is_reported(extended):
     assert "scene 'broken' of foveasim-example cannot be loaded (" in extended.stderr
     assert extended.stderr.count("cannot be loaded") == 1

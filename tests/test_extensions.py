@@ -27,9 +27,18 @@ REGISTRIES = (
     METRICS, PSF_FORMATS,
 )  # fmt: skip
 NUMBERS = count()
+#: Kinds whose files are read in several new processes.
+SLOW = {"power map format", "cube format"}
 
 
-@pytest.mark.parametrize(("kind", "name"), [found for found in extensions() if " of test_" not in found[1]])
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        pytest.param(kind, name, marks=[pytest.mark.slow] if kind in SLOW else [])
+        for kind, name in extensions()
+        if " of test_" not in name
+    ],
+)
 def test_extension_passes_its_check(kind, name):
     check_extension(kind, name)
 

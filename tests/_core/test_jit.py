@@ -309,6 +309,7 @@ def test_kernel_modules_are_found_by_content():
     assert "foveasim.view._zbuffer_kernels" in set(kernel_modules())
 
 
+@pytest.mark.slow
 def test_kernels_are_imported_inside_functions():
     imported = [
         (str(path.relative_to(PACKAGE)), name)

@@ -70,6 +70,7 @@ def dng(light, *, orientation=1, neutral=(1.0, 1.0, 1.0)):
     return file.getvalue()
 
 
+@pytest.mark.slow(keep=6)
 @pytest.mark.parametrize(("suffix", "encode"), [(".heic", heic), (".avif", avif)])
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_picture_of_a_phone_is_upright(tmp_path, suffix, encode, orientation):
@@ -149,6 +150,7 @@ def test_raw_files_and_heic_become_scenes(tmp_path):
     assert picture_names(["a.dng", "b.heic", "c.NEF", "d.avif", "e.txt"]) == ["a.dng", "b.heic", "c.NEF", "d.avif"]
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("fraction", [0.02, 0.5, 0.95])
 @pytest.mark.parametrize(("name", "encode"), [("a.heic", lambda: heic(FLAT)), ("a.dng", lambda: dng(FLAT / 255.0))])
 def test_truncated_file_gives_one_line(tmp_path, capfd, name, encode, fraction):

@@ -1181,6 +1181,7 @@ MALFORMED_ZARR = {
 }
 
 
+@pytest.mark.slow
 def test_malformed_zarr_raises_one_line_errors(tmp_path):
     paths = []
     for name, change in MALFORMED_ZARR.items():
@@ -1222,7 +1223,7 @@ FRAGILE = ("exr", "nc", "mat", "mat73")
 N_CORRUPT = 40
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("extension", ["npy", "npz", "fits", "tif", *FRAGILE])
 def test_corrupt_files_are_handled(valid_files, tmp_path, extension):
     """Truncated files, random bytes after the header, and flipped bits: each yields a map or an error of one line."""

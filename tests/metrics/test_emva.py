@@ -432,6 +432,7 @@ def test_simultaneous_intervals_contain_parameters(sensors):
     assert np.mean([np.ptp(each.intervals["saturation_ph"][0]) for each in sensors]) < 0.5 * saturation_ph
 
 
+@pytest.mark.slow
 def test_dsnu_below_noise_is_not_resolved(sensors):
     """The noise of the mean of six frames is 9 e-; a standard deviation of 0.2 e- is lost in its sample variance."""
     estimates = np.array([each.dsnu_e[1] for each in sensors])

@@ -462,7 +462,7 @@ def test_unit_lateral_colour_is_bit_identical():
     assert np.array_equal(plain, same)
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("moved_cells", [3.0, 11.3, 27.0])
 def test_tilt_displaces_psf_over_wide_cells(moved_cells):
     """Reference: the same tilt on cells a fifth as wide as 2.6 λN, binned."""

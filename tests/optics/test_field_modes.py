@@ -42,14 +42,15 @@ def few_points(monkeypatch):
 
 
 @pytest.fixture
-def linear(monkeypatch, few_points):
-    """Weights that are linear between the points, as those of patches."""
+def linear(monkeypatch):
+    """PSFs at 3 x 3 points of the field, with weights that are linear between them, as those of patches."""
 
     def splines(n_points, at, degree=3):
         unit = np.eye(n_points)
         return np.stack([np.interp(at, np.linspace(0, 1, n_points), row) for row in unit], axis=1), unit
 
     monkeypatch.setattr(_field_modes, "splines", splines)
+    monkeypatch.setattr(_field_modes, "FIELD_POINTS", (3,))
 
 
 # Cells of 0.4, 0.8 and 2.3 λN (aliases), finer cells, several basis images and wavelengths.
@@ -69,7 +70,7 @@ def linear(monkeypatch, few_points):
 @pytest.mark.usefixtures("linear")
 def test_all_modes_equal_patches(options, changes):
     scene, lens = noise(**options), replace(LENS, **changes)
-    patches = replace(lens, field_patches=5, padding_cells=lens.padding_cells).power_map(scene).data
+    patches = replace(lens, field_patches=3, padding_cells=lens.padding_cells).power_map(scene).data
     modes = replace(lens, field_modes=80).power_map(scene).data
 
     # Aliases are interpolated to 1e-4 of the peak, for transforms of other sizes; smaller images have their own patches.
@@ -80,11 +81,12 @@ def test_all_modes_equal_patches(options, changes):
 @pytest.mark.usefixtures("linear")
 def test_all_modes_equal_patches_in_single_precision():
     scene, lens = noise(), replace(LENS, precision="single")
-    patches = replace(lens, field_patches=5).power_map(scene).data
+    patches = replace(lens, field_patches=3).power_map(scene).data
 
     np.testing.assert_allclose(replace(lens, field_modes=80).power_map(scene).data, patches, atol=1e-6 * patches.max())
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize(
     ("padding", "precision", "tolerance"),
     [
@@ -156,7 +158,7 @@ def point_maps():
     return [(scene, map_of_own_psf(LENS, scene, *point)) for scene, point in scenes]
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [0.1, 0.03, 0.01])
 def test_field_error_bounds_displaced_light(tolerance, point_maps):
     lens = replace(LENS, field_tolerance=tolerance)
@@ -170,6 +172,7 @@ def test_field_error_bounds_displaced_light(tolerance, point_maps):
     assert max(displaced) > 0.1 * error
 
 
+@pytest.mark.slow
 def test_wide_cells_need_fewer_modes():
     # Cells of 2.3 λN: light that is displaced within them does not count.
     n = 64
@@ -189,6 +192,7 @@ def test_wide_cells_need_fewer_modes():
     assert max(displaced) <= error <= 0.01
 
 
+@pytest.mark.usefixtures("few_points")
 def test_fewer_modes_suffice_for_larger_tolerances():
     scene = noise()
     numbers = [
@@ -244,6 +248,7 @@ def test_lenses_without_modes_are_rejected(changes):
         replace(LENS, **changes).psf_modes(noise())
 
 
+@pytest.mark.usefixtures("few_points")
 def test_equal_psfs_need_no_modes():
     nearly = replace(LENS, seidel=Seidel(spherical_um=0.1, coma_um=1.0, field_radius_um=1e7))
     scene = noise()
@@ -253,6 +258,7 @@ def test_equal_psfs_need_no_modes():
     np.testing.assert_allclose(nearly.power_map(scene).data, fixed, rtol=1e-6)
 
 
+@pytest.mark.usefixtures("few_points")
 def test_turned_scene_has_turned_map():
     # The aberrations have the symmetry; the picture is turned by 180 degrees.
     image = np.random.default_rng(3).random((40, 40))

@@ -129,6 +129,7 @@ def write_as(path, psf, x_um, y_um):
 # -- conventions ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", FILES)
 def test_airy_psf_equals_clear_circle(tmp_path, name):
     n = 840
@@ -234,6 +235,7 @@ def test_bins_are_divided_by_their_width():
 # -- over the field ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize(
     ("kind", "options", "changes"),
     [
@@ -278,6 +280,7 @@ def test_point_images_follow_from_samples():
     np.testing.assert_allclose(*energy, atol=0.008)
 
 
+@pytest.mark.slow
 def test_wavelengths_are_interpolated(monkeypatch):
     monkeypatch.setattr(_field_modes, "FIELD_POINTS", (3,))
     lens = replace(LENS, seidel=SEIDEL)
@@ -393,6 +396,7 @@ def test_one_psf_is_that_of_the_field():
     np.testing.assert_allclose(other[5:], one[:-5], rtol=0.02, atol=0.02 * one.max())
 
 
+@pytest.mark.slow
 def test_lateral_colour_scales_images():
     colours = LateralColour(wavelength_nm=(500.0, 600.0), magnification=(0.98, 1.0))
     lens, scene = replace(LENS, seidel=SEIDEL, lateral_colour=colours), noise(waves_nm=(500.0, 600.0))
@@ -432,6 +436,7 @@ def test_table_of_the_cosine_law_gives_it():
     np.testing.assert_allclose(replace(lens, relative_illumination=table).power_map(scene).data, expected, rtol=3e-4)
 
 
+@pytest.mark.slow
 def test_relative_illumination_weighs_the_source():
     lens, scene = LENS, scene_of(np.ones((60, 60)))
     points_um = grid_points(lens, scene, 3)
@@ -472,6 +477,7 @@ def test_tiles_equal_captures(camera):
     np.testing.assert_array_equal(np.concatenate([tile.code for tile in tiles]), whole.code)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::foveasim.errors.CoverageWarning")
 def test_lenses_are_pickled_and_shared_by_threads(camera):
     scene = noise()

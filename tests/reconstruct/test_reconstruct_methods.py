@@ -187,6 +187,7 @@ def test_points_are_in_their_triangles(kind):
     assert (found[500:] >= 0).all()
 
 
+@pytest.mark.slow
 def test_natural_neighbours_match_voronoi_reference():
     layout = fs.layout.sunflower(n_sites=40, spacing_um=2.0)
     xy = layout.centroid_um
@@ -434,6 +435,7 @@ def test_nonconvergence_raises_simulation_error():
         fit(FOVEAL, values, raster_grid(FOVEAL, 60), mu=1e-3, max_steps=2)
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("name", ["astronaut", "coffee", "chelsea"])
 @pytest.mark.parametrize(
     "layout",

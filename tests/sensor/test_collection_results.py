@@ -55,6 +55,7 @@ def sensor_of(collection, **changes):
     return Sensor(LAYOUT, **{**ELECTRONICS, **changes}, effects=[collection])
 
 
+@pytest.mark.slow(keep=1)
 @COLLECTIONS
 @pytest.mark.parametrize("coupling", [None, InterPixelCapacitance(neighbour_fraction=0.02)])
 def test_prediction_and_model_match_draws(collection, coupling):

@@ -78,7 +78,7 @@ def test_diffusion_preserves_uniform_irradiance(name, spread_um):
     np.testing.assert_allclose(Diffusion(spread_um=spread_um).compile(layout).apply(uniform_e), uniform_e, rtol=1e-10)
 
 
-@pytest.mark.slow(keep=3)
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("name", sorted(LAYOUTS.keys() - {"hexagons with gaps"}))
 def test_repeated_diffusion_equalises_charge_density(name):
     layout = layout_of(name)

@@ -330,6 +330,7 @@ def test_microlenses_lose_nothing_within_inscribed_circle(shape):
             assert found < 0.99
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("f_number", [1.4, 2.8])
 @pytest.mark.parametrize("angle_deg", [0.0, 12.0, 25.0])
 @pytest.mark.parametrize("layout", [SQUARE, CONCAVE], ids=["square", "concave"])

@@ -99,6 +99,7 @@ def test_prediction_with_all_effects_matches_draws(bits, companding):
     assert_agree(sensor, sensor.expected_electrons(PHOTO_E, 1.0))
 
 
+@pytest.mark.slow(keep=12)
 @pytest.mark.parametrize(
     "parameters",
     [

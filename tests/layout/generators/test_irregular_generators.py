@@ -172,6 +172,7 @@ def test_cells_tile_region_with_hole():
     assert_tiles(layout, 400 - 64)
 
 
+@pytest.mark.slow
 def test_10000_cells_tile():
     layout = as_layout(*voronoi_cells(points_in(BOX, 10_000, 2), BOX))
 
@@ -408,6 +409,7 @@ def test_published_sunflower_constant_gives_unit_spacing():
     assert sorted(np.argsort(distance)[:2].tolist()) == [0, 3]
 
 
+@pytest.mark.slow
 def test_inner_sunflower_sites_have_equal_area():
     layout = sunflower(n_sites=5000, spacing_um=1.0)
 
@@ -459,6 +461,7 @@ def test_density_driven_sites_tile_region(n_sites, region, density, n_iterations
     assert layout.columns["share"].mean() == pytest.approx(1.0, rel=1e-12)
 
 
+@pytest.mark.slow
 @given(seeds)
 @settings(relaxed, max_examples=examples(5))
 def test_layout_depends_only_on_seed(seed):
@@ -673,6 +676,7 @@ def test_equal_capacity_without_density_is_equal_area(n_sites, region):
     np.testing.assert_allclose(layout.area_um2, region.area / n_sites, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_equal_capacity_sites_are_as_compact():
     """Minimum spacing, and perimeter of a site of unit area: 3.72 for a hexagon, 4 for a square."""
     free, equal = (voronoi(n_sites=600, size_um=(30.0, 20.0), capacity=capacity) for capacity in ("free", "equal"))
@@ -685,6 +689,7 @@ def test_equal_capacity_sites_are_as_compact():
     assert free.columns["share"].std() > 0.05
 
 
+@pytest.mark.slow
 def test_equal_capacity_with_large_density_range():
     layout = voronoi(
         n_sites=1000, region=disc(100.0, 360), density=lambda xy_um: fovea(5 * xy_um) ** 1.5, capacity="equal"
@@ -695,6 +700,7 @@ def test_equal_capacity_with_large_density_range():
     np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("n_sites", [5, 40])
 def test_equal_capacity_with_black_areas(n_sites):
     """White squares on black, none of which has the mass of an integer number of sites."""
@@ -724,6 +730,7 @@ def test_centres_move_until_capacities_are_equal():
     np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_centres_converge_to_centres_of_mass():
     field = _density(fovea, None, BOX)[0]
     centres = points_in(BOX, 200, 0)
@@ -759,12 +766,14 @@ def test_mass_derivatives_agree_with_differences(kind, is_own):
     np.testing.assert_allclose(slopes.sum(axis=0), 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_equal_capacity_layout_is_reproducible():
     first, repeated = (voronoi(n_sites=40, region=STAR, density=fovea, capacity="equal", seed=3) for _ in range(2))
 
     assert_same(first, repeated)
 
 
+@pytest.mark.slow
 def test_equal_capacity_of_discontinuous_function_raises():
     with pytest.raises(GeometryError, match=r"found no cells of equal capacity: the smallest .* a picture instead"):
         voronoi(
