@@ -109,6 +109,18 @@ def test_barrel_fold_matches_closed_form():
     assert lens.distort(masked[:1]) == pytest.approx(np.array([[10.0, 0.0]]))
 
 
+@pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, 270.0])
+def test_image_limit_is_smallest_over_directions(turn_deg):
+    turn = math.radians(turn_deg)
+    p2, p1 = 0.02 * math.cos(turn), 0.02 * math.sin(turn)
+    lens = BrownConrady(focal_um=1000.0, k1=-0.3, p1=p1, p2=p2)
+    ideal_um, real_um = lens.max_radius_um
+    angle = np.linspace(0.0, 2.0 * np.pi, 3601)
+    boundary_um = 0.99999 * ideal_um * np.stack((np.cos(angle), np.sin(angle)), axis=1)
+
+    assert real_um == pytest.approx(np.hypot(*lens.distort(boundary_um).T).min(), rel=1e-4)
+
+
 def test_lens_without_coefficients_is_identity():
     points_um = disc(5000.0)
 
@@ -241,6 +253,15 @@ def test_scaramuzza_inverse_is_accurate(stretch):
 
     assert np.abs(lens.distort(ideal_um) - real_um).max() / 2.2 < 1e-10
     np.testing.assert_allclose(lens.undistort(lens.distort(ideal_um)), ideal_um, rtol=1e-12)
+
+
+def test_scaramuzza_inverts_up_to_its_fold():
+    # The depth 1 + 2 r² makes the angle of the rays largest at r = sqrt(1/2), in focal lengths.
+    lens = Scaramuzza(a=(1000.0, 2e-3, 0.0, 0.0), pixel_um=1.0, focal_um=1000.0)
+    assert lens.max_radius_um[1] == pytest.approx(1000.0 * math.sqrt(0.5))
+    real_um = disc(0.999 * lens.max_radius_um[1], 200)
+
+    np.testing.assert_allclose(lens.distort(lens.undistort(real_um)), real_um, atol=1e-6)
 
 
 def test_ray_direction_matches_scaramuzza_polynomial():

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import foveasim as fs
-from foveasim.optics import Zernike
-from foveasim.optics.otf import PlaneTables
+from foveasim.optics import Zernike, circular_otf
+from foveasim.optics.otf import PlaneTables, RadialTables
 
 WAVELENGTH_NM = np.array([450.0, 550.0, 650.0])
 LENS = fs.Optics(focal_length_mm=8.0, f_number=8.0, zernike=Zernike(coefficients={4: 0.02}))
@@ -78,3 +78,17 @@ def test_prepared_sums_are_limited(tables):
     np.testing.assert_allclose(
         sum(tables(weight)[0] for weight in np.eye(3)), tables(np.ones(3))[0], rtol=1e-12, atol=1e-12
     )
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+def test_lower_cutoff_is_sampled_as_finely(real):
+    """The error of linear interpolation, with the closed form as the reference."""
+    low, high = 0.1, 0.8
+    errors = []
+    for cutoffs in ([low], [low, high]):
+        table, steps_per_f = RadialTables(np.array(cutoffs), real)(np.array([1.0, 0.0][: len(cutoffs)]))
+        f = np.random.default_rng(0).uniform(0.0, low, 20_000)
+        found = np.interp(f * steps_per_f, np.arange(len(table)), table)
+        errors.append(np.abs(found - circular_otf(f / low)).max())
+
+    assert errors[1] < 1.5 * errors[0]
