@@ -329,6 +329,7 @@ def test_served_page_listens_on_one_address(served_port):
         connect(served_port, host="127.0.0.2")
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_busy_server(serve):
     port, server = serve()
     with connect(port), connect(port, f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n") as reading:

@@ -97,6 +97,7 @@ def draw_chip(path):
     library.write_gds(path)
 
 
+@pytest.mark.slow
 def test_chip_with_filter_layers_off_centre(folder, in_folder):
     draw_chip(folder / "chip.gds")
     options = ("--channels", "10/0=R,11/0=G,12/0=B", "--centre")
@@ -129,6 +130,7 @@ def test_dataset_of_random_cameras(folder, in_folder):
     assert {sample["label"] for sample in samples} <= {"person", 0}
 
 
+@pytest.mark.slow
 def test_video_with_gaze_and_events(folder, in_folder):
     frames = folder / "frames"
     frames.mkdir()
@@ -153,6 +155,7 @@ def test_video_with_gaze_and_events(folder, in_folder):
     assert set(np.unique(events.polarity)) == {-1, 1}
 
 
+@pytest.mark.slow
 def test_page_in_3d(folder, in_folder):
     in_folder("run", "shot.yaml", "--out", "out")
     in_folder("view", "out/shot_capture.npz", "--solid", "--out", "page.html")

@@ -101,7 +101,7 @@ def covariance():
 
 def test_site_information_matches_determinant(small, covariance):
     noise = small.area_um2 * np.linspace(1.0, 3.0, small.n_sites)
-    signal = exact_covariance(small, covariance, 60)
+    signal = exact_covariance(small, covariance, 40)
 
     bits = site_information_bits(small, covariance, small.area_um2, [noise, 2.0 * noise], n_conditions=small.n_sites)
 

@@ -90,7 +90,7 @@ def test_wrong_values_give_one_line(kind):
     assert [line for key, line in errors if "\n" in line or key not in line] == []
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=("rules", "sweep"))
 @pytest.mark.parametrize("kind", FILES)
 def test_validation_accepts_what_schema_accepts(kind):
     jsonschema = pytest.importorskip("jsonschema")

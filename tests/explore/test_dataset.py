@@ -169,9 +169,9 @@ def test_draws_of_camera_differ_in_noise():
 
 
 def test_seeds_give_different_cameras():
-    found = [explore.Dataset(pictures(1), SHOT, VARY, seed=seed)[0]["settings"]["exposure_s"] for seed in range(20)]
+    found = [explore.Dataset(pictures(1), SHOT, VARY, seed=seed)[0]["settings"]["exposure_s"] for seed in range(8)]
 
-    assert len(set(found)) == 20
+    assert len(set(found)) == 8
 
 
 def test_random_settings_are_drawn_independently():
@@ -269,10 +269,10 @@ def test_boxes_are_clipped_to_picture():
 
 
 def test_samples_contain_indices_of_choices():
-    data = explore.Dataset(pictures(20), SHOT, VARY)
+    data = explore.Dataset(pictures(10), SHOT, VARY)
     choices = VARY["sensor.qe"]["choice"]
 
-    for k in range(20):
+    for k in range(10):
         assert data.settings_of(k)["sensor"]["qe"] == choices[data[k]["settings"]["sensor.qe"]]
 
 
@@ -283,7 +283,7 @@ def test_code_dtype_follows_largest_bit_depth():
     assert explore.Dataset(pictures(1), SHOT)[0]["code"].dtype == np.uint8
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
 @pytest.mark.parametrize(
     "vary",
@@ -296,9 +296,9 @@ def test_stored_settings_are_exact(name, vary, tmp_path):
     """The type of the first number, integer or float, does not truncate the others."""
     is_integer_first = set()
     for seed in (0, 4, 5):
-        data = explore.Dataset(pictures(12), SHOT, vary, seed=seed, fields=())
+        data = explore.Dataset(pictures(6), SHOT, vary, seed=seed, fields=())
         stored, samples = explore.write_dataset(data, tmp_path / f"{seed}{name}"), list(data)
-        assert len(samples) == 12
+        assert len(samples) == 6
         for k, sample in enumerate(samples):
             assert_same(stored[k], sample)
             settings = data.settings_of(k)
@@ -649,7 +649,7 @@ def test_palette_mask_gives_indices(tmp_path):
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow(keep=("1-data.zarr",))
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
 @pytest.mark.parametrize("workers", [1, 2])
 def test_stored_samples_equal_simulated_samples(name, workers, tmp_path):
@@ -867,7 +867,7 @@ def test_writing_resumes_after_corrupt_picture(name, workers, tmp_path):
         assert_same(stored[k], data[k])
 
 
-#: Writes datasets with a number of workers, each in a process of its own that ends at the sixth picture.
+#: Writes datasets with a number of workers, one after another, each in a process of its own that ends at the sixth picture.
 ENDED_PROGRAM = """
 import json, os, sys
 import numpy as np
@@ -880,10 +880,10 @@ class Pictures:
             os._exit(9)
         return np.random.default_rng(k).integers(0, 256, (40, 48, 3), np.uint8)
 if __name__ == '__main__':
-    shot = json.loads(sys.argv[2])
-    for path in sys.argv[3:]:
+    shot = json.loads(sys.argv[1])
+    for workers, path in (each.split("=") for each in sys.argv[2:]):
         if (process := os.fork()) == 0:
-            explore.write_dataset(explore.Dataset(Pictures(), shot), path, per_shard=2, workers=int(sys.argv[1]))
+            explore.write_dataset(explore.Dataset(Pictures(), shot), path, per_shard=2, workers=int(workers))
             os._exit(0)
         print(path, os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]), flush=True)
 """
@@ -894,14 +894,11 @@ def test_crash_leaves_only_complete_shards(tmp_path):
     script = tmp_path / "write.py"
     script.write_text(ENDED_PROGRAM)
     both = [str(tmp_path / "data.zarr"), str(tmp_path / "data")]
+    written = [f"1={both[0]}", f"1={both[1]}", f"2={both[1]}"]
+    command = [sys.executable, str(script), json.dumps(SHOT), *written]
+    lost = subprocess.run(command, check=False, capture_output=True, text=True, timeout=DEADLINE_S)
 
-    def run(workers, *paths):
-        command = [sys.executable, str(script), str(workers), json.dumps(SHOT), *paths]
-        return subprocess.run(command, check=False, capture_output=True, text=True, timeout=DEADLINE_S)
-
-    assert run(1, *both).stdout.splitlines() == [f"{path} 9" for path in both]
-    lost = run(2, both[1])
-
+    assert lost.stdout.splitlines()[:2] == [f"{path} 9" for path in both]
     assert "SimulationError: the process that wrote shard 2 ended in every attempt" in lost.stderr
     source = Lazy([np.random.default_rng(k).integers(0, 256, (40, 48, 3), np.uint8) for k in range(8)])
     data = explore.Dataset(source, SHOT)
@@ -1369,7 +1366,7 @@ def test_settings_accept_numpy_scalars():
 
 
 def test_denoising_target_is_mean_of_draws():
-    n_draws = 200
+    n_draws = 100
     data = explore.denoising(pictures(1), SHOT, draws=n_draws)
     samples = list(data)
     codes = np.stack([sample["code"] for sample in samples]).astype(float)
@@ -1377,16 +1374,16 @@ def test_denoising_target_is_mean_of_draws():
     capture = data.capture(0)
     _, variance_dn2 = shot.camera.sensor.predict(capture.expected_e)
     off_dn = np.abs(codes.mean(axis=0) - target_dn)
-    is_noisy = variance_dn2 > 0.02
+    is_noisy = variance_dn2 > 4.0 / n_draws
 
     assert len({sample["settings"]["exposure_s"] for sample in samples}) == 1
     assert is_noisy.sum() > 20
     assert (off_dn / np.sqrt(variance_dn2 / n_draws))[is_noisy].max() < 5.0
-    assert off_dn[~is_noisy].max(initial=0.0) < 5.0 * np.sqrt(0.02 / n_draws)
+    assert off_dn[~is_noisy].max(initial=0.0) < 10.0 / n_draws
 
 
 def test_classification_draws_cameras_around_shot():
-    data = explore.classification(pictures(30), SHOT, {"sensor.bits": {"choice": [6, 8]}}, labels=[0] * 30)
+    data = explore.classification(pictures(15), SHOT, {"sensor.bits": {"choice": [6, 8]}}, labels=[0] * 15)
     drawn = [sample["settings"] for sample in data]
     f_numbers = np.array([each["optics.f_number"] for each in drawn])
 
@@ -1394,9 +1391,9 @@ def test_classification_draws_cameras_around_shot():
     assert f_numbers.min() >= 2.8 / 1.5
     assert f_numbers.max() <= 8.4
     assert f_numbers.max() / f_numbers.min() > 2.0
-    assert len({each["sensor.device_seed"] for each in drawn}) == 30
+    assert len({each["sensor.device_seed"] for each in drawn}) == 15
     assert {each["sensor.bits"] for each in drawn} == {6, 8}
-    data = explore.denoising(pictures(1), SHOT, draws=1, cameras=40, changes={"exposure_s": 3.2})
+    data = explore.denoising(pictures(1), SHOT, draws=1, cameras=20, changes={"exposure_s": 3.2})
     assert all(0.1 <= sample["settings"]["exposure_s"] <= 3.2 for sample in data)
     with pytest.raises(ConfigError, match="exposure_s: missing"):
         explore.classification(pictures(1), {key: value for key, value in SHOT.items() if key != "exposure_s"})
@@ -1412,6 +1409,7 @@ def test_missing_torch_gives_install_hint(monkeypatch):
         explore.torch_dataset(labelled(1))
 
 
+@pytest.mark.slow
 def test_dataset_does_not_import_torch():
     code = "import sys; from foveasim import explore; sys.exit('torch' in sys.modules or 'zarr' in sys.modules)"
 
