@@ -432,3 +432,21 @@ def test_camera_prediction_matches_captures():
     # Sites are independent: the relative standard error of a variance.
     error = np.sqrt(2.0 * (variance_dn2**2).sum() / n_frames) / variance_dn2.sum()
     assert frames.var(axis=0, ddof=1).sum() == pytest.approx(variance_dn2.sum(), rel=SIGMAS * error)
+
+
+def test_predicted_covariance_matches_draws():
+    """Neighbours share charge; the noise spans two codes, and the ADC is 3 % nonlinear."""
+    n = 60
+    sensor = Sensor(
+        line_of(n), bits=8, v_sat_v=1.0, capacitance_f=2**8 * 16 * scipy.constants.e, nonlinearity_fraction=0.03,
+        coupling=InterPixelCapacitance(neighbour_fraction=0.05),
+    )  # fmt: skip
+    expected_e = np.full(n, 1000.0)
+    predicted = sensor.predict_covariance(expected_e, np.arange(n))
+    off = draw_codes(sensor, expected_e) - sensor.predict(expected_e)[0]
+
+    for lag in (0, 1, 2):
+        products = (off[:, : n - lag] * off[:, lag:]).mean(axis=1)
+        error = products.std() / np.sqrt(N_DRAWS)
+        assert products.mean() == pytest.approx(np.diagonal(predicted, lag).mean(), abs=SIGMAS * error)
+        assert lag == 2 or products.mean() > 2.0 * SIGMAS * error

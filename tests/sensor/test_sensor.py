@@ -524,9 +524,11 @@ def test_transition_charges_have_higher_code(v_sat_v, bits, e_per_dn):
         assert np.array_equal(sensor.read(codes * e_per_dn + e_per_dn - 1, seed=0), codes)
 
 
-def test_filters_require_channel_column():
-    with pytest.raises(SimulationError, match="the sensor has 3 filters, but the layout has no column 'channel'"):
-        fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), filters="rgb")
+@pytest.mark.parametrize("n_filters", [2, 3])
+def test_filters_require_channel_column(n_filters):
+    filters = FilterSet([ConstantCurve(0.5)] * n_filters)
+    with pytest.raises(SimulationError, match=f"has {n_filters} filters, but the layout has no column 'channel'"):
+        fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), filters=filters)
 
 
 def test_single_filter_rejects_three_channel_mosaic():
