@@ -542,3 +542,12 @@ def test_single_filter_rejects_three_channel_mosaic():
 def test_implausible_capacitance_is_rejected(capacitance_f):
     with pytest.raises(ParameterError, match=r"'capacitance_f' must be from .* capacitances are in farad"):
         fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), capacitance_f=capacitance_f)
+
+
+def test_arrays_are_those_of_parameters_without_layout():
+    layout = fs.layout.grid(n_x=50, n_y=50, pitch_um=1.0)
+    sensitivity = np.linspace(0.9, 1.0, 2500)
+
+    assert dict(Sensor(layout).arrays) == {}
+    (found,) = Sensor(layout, sensitivity=sensitivity).arrays.values()
+    np.testing.assert_array_equal(found, sensitivity)
