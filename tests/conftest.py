@@ -86,12 +86,11 @@ def pytest_configure(config):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """Collect without garbage collections, and leave modules and tests out of all later ones: nothing of them is released."""
+    """Collect without garbage collections: nothing of modules and tests is released."""
     gc.disable()
     try:
         return (yield)
     finally:
-        gc.freeze()
         gc.enable()
 
 
