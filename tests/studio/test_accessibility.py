@@ -54,7 +54,7 @@ def check(page, part="html"):
     assert violations_in_themes(page, part) == [], page.viewport_size
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=("solid",))
 @pytest.mark.parametrize(
     "make", [capture_page, rules_page, lambda: solid_page(LAYOUT), report], ids=["capture", "rules", "solid", "report"]
 )

@@ -67,7 +67,6 @@ def test_worst_problem_and_badges_are_visible(visit):
     assert "saturated" in page.get_attribute("#worst-text", "title")
 
 
-@pytest.mark.slow(keep=1)
 def test_fit_scene_covers_all_photosites(visit):
     page = visit()
     check_fit_scene(page)
@@ -110,7 +109,6 @@ def test_first_tiles_have_content(visit):
 # -- charts ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow(keep=1)
 def test_root_axes_have_round_ticks(visit):
     page = visit()
     for most in (1, 7, 912, 3890, 14_208, 1_000_000):

@@ -109,7 +109,7 @@ def test_frames_use_constant_disk_and_cache(recorder, clip):
     assert set(sizes) == {(1, sizes[0][1])}
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("n", [10, -1, 1.0, True, None, "1"])
 def test_missing_frames_give_one_line(recorder, clip, n):
     opened(recorder, clip)

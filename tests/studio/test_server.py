@@ -500,7 +500,7 @@ class Program:
         return self.process.returncode, errors
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_signals_delete_uploaded_files(name, tmp_path):
     """Also those of a session with an open page; the exit code is that of the signal."""

@@ -51,7 +51,7 @@ def test_all_bundled_generators_have_templates():
     assert set(generators()) == set(fs.layout.LAYOUTS.within("foveasim.layout.generators"))
 
 
-@pytest.mark.slow(keep=3)
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("n_sites", [2000, 9000])
 @pytest.mark.parametrize("generator", generators())
 def test_template_fills_its_format(recorder, generator, n_sites):
