@@ -52,7 +52,7 @@ def test_all_bundled_generators_have_templates():
 
 
 @pytest.mark.slow(keep=2)
-@pytest.mark.parametrize("n_sites", [2000, 9000])
+@pytest.mark.parametrize("n_sites", [1000, 4000])
 @pytest.mark.parametrize("generator", generators())
 def test_template_fills_its_format(recorder, generator, n_sites):
     width_um, height_um = OPTICAL_FORMATS["1/2.3"].size_um
@@ -87,7 +87,7 @@ def test_new_sensor_is_one_step(recorder, settings):
 @pytest.mark.parametrize("filters", [None, *mosaics()])
 @pytest.mark.parametrize("generator", ["hexagonal", "voronoi"])
 def test_filters_are_those_of_the_template(recorder, generator, filters):
-    state = create(recorder, generator=generator, filters=filters)
+    state = create(recorder, generator=generator, filters=filters, n_sites=500)
     layout = recorder.session.result.capture.layout
 
     assert state["errors"] == {}
