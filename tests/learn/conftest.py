@@ -10,6 +10,8 @@ from importlib.util import find_spec
 
 import pytest
 
+from foveasim.optics import _field_modes
+
 DEVICES = ["cpu", "meta"]
 if find_spec("torch"):
     import torch
@@ -22,6 +24,12 @@ if find_spec("torch"):
 @pytest.fixture(params=DEVICES)
 def device(request):
     return torch.device(request.param)
+
+
+@pytest.fixture(autouse=True)
+def few_points(monkeypatch):
+    """Sample PSFs that vary over the field at 5 x 5 points instead of 9 x 9 or 17 x 17, in layers and simulator."""
+    monkeypatch.setattr(_field_modes, "FIELD_POINTS", (5,))
 
 
 @pytest.fixture(autouse=find_spec("torch") is not None)

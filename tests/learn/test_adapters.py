@@ -102,6 +102,7 @@ def test_transform_replaces_images_only():
 # -- other runtimes ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize("name", ["aberrated", "distorted", "modes", "mixing", "converter"])
 def test_layer_can_be_exported(name):
     """The exported program has the batch size as a variable, and the same results."""

@@ -69,6 +69,7 @@ BUNDLED = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("name", BUNDLED)
 def test_layer_agrees_with_camera_for_bundled_sensors(name):
     original, light = camera(fs.read_layout(name)), scene()
@@ -158,6 +159,7 @@ def test_layer_is_adjoint_to_its_gradient(name):
         assert float((adjoint * pictures).detach().sum()) == pytest.approx(float(product.detach()), rel=limit)
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize(
     ("changes", "wrt"),
     [

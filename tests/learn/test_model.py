@@ -62,6 +62,7 @@ def test_maps_agree_with_simulator(padding, oversample):
     np.testing.assert_allclose(maps.numpy(), expected, rtol=0, atol=1e-13 * expected.max())
 
 
+@pytest.mark.slow(keep=5)
 @pytest.mark.parametrize(
     ("changes", "wrt"),
     [
@@ -190,6 +191,7 @@ def test_wrong_imaging_tensors_are_rejected(arguments, message):
 # -- distortion ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=2)
 @pytest.mark.parametrize(
     ("model", "names"),
     [

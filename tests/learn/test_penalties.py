@@ -145,6 +145,7 @@ def test_penalty_and_slope_are_continuous():
         assert below == pytest.approx(above, abs=1e-4)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("seed", range(4))
 def test_descent_from_violations_satisfies_all_rules(seed):
     mesh = jittered_mesh(seed)

@@ -28,6 +28,7 @@ def random_maps(n, seed=1):
     return torch.rand(n, *GRID.shape, dtype=torch.float64, generator=generator, requires_grad=True)
 
 
+@pytest.mark.slow(keep=5)
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("n_maps", [1, 2, 5])
 def test_first_derivatives_pass_gradcheck(order, n_maps):
