@@ -155,6 +155,7 @@ def test_imports_of_folders_are_declared(folder):
     assert {str(path.relative_to(ROOT)): names for path, names in found.items() if names} == {}
 
 
+@pytest.mark.slow
 def test_declared_distributions_are_used():
     used = {d for path in PACKAGE.rglob("*.py") for _, found in imported_distributions(path) for d in found}
     extras = set().union(*EXTRAS.values())

@@ -17,6 +17,7 @@ def modules_with_examples():
     return [pytest.param(name, marks=[of_learn] if name.startswith("foveasim.learn") else []) for name in names]
 
 
+@pytest.mark.slow(keep=60)
 @pytest.mark.parametrize("name", modules_with_examples())
 def test_examples_give_their_results(name):
     module = import_module(name)

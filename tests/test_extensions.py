@@ -555,6 +555,7 @@ def test_layout_family_passes_its_example(monkeypatch):
     check_extension("layout family", "single")
 
 
+@pytest.mark.slow
 def test_all_failures_are_listed(add):
     kind = add(LENSES, Changeable, {}, None)
 

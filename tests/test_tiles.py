@@ -78,6 +78,7 @@ def test_tiles_equal_complete_capture(camera, scene, complete, n_blocks):
         np.testing.assert_array_equal(joined(parts, name), getattr(complete, name))
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.filterwarnings("ignore:automatic oversampling chooses")
 @pytest.mark.parametrize("order", [1, 2])
 def test_tiles_of_distorted_rings_equal_capture(order):
@@ -202,6 +203,7 @@ def test_tiles_have_their_part_of_the_sensor(camera, scene, tmp_path):
     assert np.array_equal(loaded.signal_to_noise(sensor=sensor.part(slice(0, BLOCK))), tile.signal_to_noise())
 
 
+@pytest.mark.slow
 def test_stored_tiles_have_parameters_per_site(camera, scene, tmp_path):
     noise_e = np.linspace(1.0, 5.0, camera.layout.n_sites)
     noisy = camera.replace(sensor=replace(camera.sensor, effects=[RegisteredShading()], read_noise_e=noise_e))
@@ -340,6 +342,7 @@ def interrupt(monkeypatch, n_tiles, error):
     monkeypatch.setattr(tiles, "_add", add_or_fail)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("error", "raised", "message"),
     [

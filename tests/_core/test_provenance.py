@@ -112,6 +112,7 @@ CHANGES = (
 )
 
 
+@pytest.mark.slow
 def test_identity_depends_on_behaviour_only(tmp_path):
     (before,) = identities(tmp_path, [OWN], 1)
     unchanged, *changed = identities(

@@ -38,6 +38,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_layouts_are_compared_in_a_report(foveasim, folder):
     result = foveasim(
         "compare",

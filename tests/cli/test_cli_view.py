@@ -286,6 +286,7 @@ def n_connections(port):
     return sum(line.split()[1] == f"0100007F:{port:04X}" and line.split()[3] == "01" for line in lines)
 
 
+@pytest.mark.slow
 @on_linux
 def test_idle_connections_leave_the_page_served(serve):
     port, server = serve()
@@ -322,6 +323,7 @@ def test_served_page_answers_one_request_alone(served_port):
     assert ask(served_port, f"LOCALHOST:{served_port}").startswith(b"HTTP/1.1 200")
 
 
+@pytest.mark.slow
 @on_linux
 def test_served_page_listens_on_one_address(served_port):
     # 127.0.0.0/8 is this machine: a server on all addresses would answer.

@@ -111,6 +111,7 @@ def test_dead_sites_reduce_information_in_proportion():
     assert some[~is_dead] == pytest.approx(living[~is_dead], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_information_falls_with_dead_and_saturated_sites():
     comparison = compare({"all": camera(), "dead": camera(dead_fraction=0.3), "full": camera(full_well_e=20.0)})
     information = np.asarray(comparison.values["information_bit_per_site"])

@@ -82,7 +82,7 @@ def test_source_of_starting_file_gives_same_codes(tmp_path):
     assert np.array_equal(codes_of_python(to_python(settings)), codes_of_settings(settings))
 
 
-@pytest.mark.slow(keep=3)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", sorted(set(bundled_layouts()) - {"pixirad_1"}))
 def test_source_of_bundled_layouts_gives_same_codes(name):
     settings = changed(layout=name, scene__pitch_um=20000.0)

@@ -375,6 +375,7 @@ def test_cached_aberrations_equal_fresh_ones(runner):
     }
 
 
+@pytest.mark.slow
 def test_cached_sections_equal_fresh_ones(runner):
     values = [(section, value) for section, alternatives in SECTIONS.items() for value in alternatives]
 

@@ -53,6 +53,7 @@ def linear(monkeypatch):
     monkeypatch.setattr(_field_modes, "FIELD_POINTS", (3,))
 
 
+@pytest.mark.slow(keep=3)
 # Cells of 0.4, 0.8 and 2.3 λN (aliases), finer cells, several basis images and wavelengths.
 @pytest.mark.parametrize(
     ("options", "changes"),
@@ -268,6 +269,7 @@ def test_turned_scene_has_turned_map():
     np.testing.assert_allclose(turned, lens.power_map(scene_of(image)).data, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_points")
 def test_tiles_equal_captures_with_varying_psfs():
     scene = noise(32, n_basis=3, waves_nm=WAVES_NM)

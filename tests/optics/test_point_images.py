@@ -137,6 +137,7 @@ def triangle_nodes(area, n=24):
     return np.concatenate(found).T if found else np.zeros((3, 0))
 
 
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("angle_deg", [0.0, 90.0, 33.0])
 @pytest.mark.parametrize(
     "pupils", [(Blades(5, angle_deg=20.0),), (Blades(6), Slit(0.4, angle_deg=30.0), Spider(3, 0.03))]

@@ -155,6 +155,7 @@ def test_wrong_centre_displaces_light():
     assert displaced(wrong, LENS.power_map(scene).data) > 0.2
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("name", FILES)
 def test_coma_lands_in_its_quadrant(tmp_path, name):
     lens = replace(LENS, seidel=Seidel(coma_um=0.5, field_radius_um=60.0))
@@ -178,6 +179,7 @@ def test_coma_lands_in_its_quadrant(tmp_path, name):
         assert displaced(wrong, expected) > 0.4
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("kind", ["grid", "radius"])
 def test_turning_everything_changes_nothing(kind):
     lens, scene = replace(LENS, seidel=SEIDEL), noise()
@@ -263,6 +265,7 @@ def test_samples_of_lens_give_its_maps(kind, options, changes):
     assert found.sum() == pytest.approx(expected.sum(), rel=8e-3)
 
 
+@pytest.mark.slow
 def test_point_images_follow_from_samples():
     lens = replace(LENS, seidel=SEIDEL)
     psfs = imported(lens, grid_points(lens, noise(), 5), n=161)
@@ -408,6 +411,7 @@ def test_lateral_colour_scales_images():
 # -- relative illumination --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_relative_illumination_of_one_is_none():
     lens = replace(LENS, seidel=SEIDEL)
     psfs = imported(lens, grid_points(lens, noise(), 3), n=33)

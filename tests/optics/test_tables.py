@@ -28,6 +28,7 @@ def tables(monkeypatch):
     return found
 
 
+@pytest.mark.slow
 def test_threads_receive_their_own_sums(tables):
     weights = np.eye(3)[np.random.default_rng(0).integers(0, 3, 16)] + 0.5
     expected = [tables(weight)[0].copy() for weight in weights]

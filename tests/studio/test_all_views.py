@@ -144,7 +144,7 @@ def test_wrong_data_of_views_are_found(result, name, make, problem):
     assert found.startswith(problem)
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.needs("chromium")
 def test_all_views_show_their_data(visit):
     page = visit(width=1800, height=1000)

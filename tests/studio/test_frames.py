@@ -68,6 +68,7 @@ def run_settings(path, out):
 # -- videos -----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_video_frames_are_exact(recorder, clip):
     state = opened(recorder, clip)
     assert state["film"] == {
@@ -142,6 +143,7 @@ def test_saved_settings_name_the_frame(make_session, tmp_path, clip):
     assert {path.name for path in (tmp_path / "out").glob("*.png")} == {"clip_frame_4.png", "clip_frame_6.png"}
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("name", "content"), [("a.mp4", b"text " * 99), ("b.avi", b"RIFF" + bytes(99)), ("c.gif", b"")]
 )

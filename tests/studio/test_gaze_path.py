@@ -133,6 +133,7 @@ def test_frame_and_gaze_are_one_message(recorder, clip):
     assert not session.result.is_preview
 
 
+@pytest.mark.slow
 def test_frames_have_codes_of_video_command(recorder, clip, tmp_path):
     for name, value in NOISELESS.items():
         recorder.do(do="set", key=f"sensor.{name}", value=value, id=1)

@@ -67,6 +67,7 @@ def test_filters_bring_their_mosaic(recorder):
     assert coloured["edits"] == [{"kind": "graph_colouring", "n_channels": 3}]
 
 
+@pytest.mark.slow
 def test_bundled_layouts_and_files_have_filters(recorder, tmp_path):
     choose(recorder, "voronoi")
     state = recorder.do(do="preset", name="layout:giotto_1")

@@ -50,6 +50,7 @@ def test_sections_of_a_clear_circle_are_equal(simulate):
     assert about["note"].startswith(f"{wave_nm:g} nm")
 
 
+@pytest.mark.slow
 def test_sections_are_those_at_pinned_photosites(simulate):
     layout = simulate().shot.camera.layout
     x_um, y_um = layout.centroid_um.T

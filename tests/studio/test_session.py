@@ -665,6 +665,7 @@ def test_thread_survives_unexpected_exceptions(settings, monkeypatch):
     assert threading.active_count() < 50
 
 
+@pytest.mark.slow
 def test_session_without_page_releases_its_results(settings, monkeypatch):
     monkeypatch.setattr(_session, "FORGET_S", 0.05)
     monkeypatch.setattr(_session, "RELEASE_S", 0.05)

@@ -505,6 +505,7 @@ def test_mesh_values_are_active_and_titled():
     assert set(mesh.cell_data.keys()) == {"electrons / e-", "site", "rgb"}
 
 
+@pytest.mark.slow
 @pytest.mark.needs("renderer")
 def test_right_click_finds_visible_site():
     taken = capture()

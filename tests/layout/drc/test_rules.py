@@ -221,6 +221,7 @@ def test_width_ignores_coincident_vertices():
     assert min_width_um(shifted)[0] == pytest.approx(3.0)
 
 
+@pytest.mark.slow(keep=8)
 @pytest.mark.parametrize("shape", [shape for shape, _ in WIDTHS.values()], ids=WIDTHS)
 @given(angle_deg=st.floats(0, 360), factor=st.floats(0.1, 10), shift_um=st.integers(-1000, 1000))
 @settings(relaxed, max_examples=examples(15))

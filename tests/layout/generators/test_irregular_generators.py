@@ -480,6 +480,7 @@ def test_lloyd_iterations_equalise_areas():
     assert converged.area_um2.std() / converged.area_um2.mean() < 0.08
 
 
+@pytest.mark.slow
 def test_relaxed_centres_have_blue_noise_spacing():
     """Minimum spacing of 0.7 of hexagonal packing; that of random points is about 0."""
     layout = voronoi(n_sites=1000, size_um=(40.0, 25.0), n_iterations=40)
@@ -723,6 +724,7 @@ def test_divided_cell_retains_heaviest_part():
     np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_centres_move_until_capacities_are_equal():
     """No weights solve for the initial centres in a star: the parts that its notches separate are too large."""
     layout = voronoi(n_sites=150, region=STAR, n_iterations=0, capacity="equal", seed=1)
