@@ -13,6 +13,7 @@ from types import ModuleType
 
 import pytest
 from PIL import Image
+from registries import restored
 
 from foveasim._core.registry import Registry
 from foveasim.sensor import Sensor
@@ -83,12 +84,8 @@ def _registries_stay():
     """Restore the registries after a page."""
     modules = [module for name, module in sys.modules.items() if name.startswith("foveasim")]
     found = [item for module in modules for item in vars(module).values() if issubclass(type(item), Registry)]
-    registries = {id(registry): registry for registry in found}.values()
-    before = [dict(registry) for registry in registries]
-    yield
-    for registry, objects in zip(registries, before, strict=True):
-        registry._objects = objects
-        registry.version += 1
+    with restored(*{id(registry): registry for registry in found}.values()):
+        yield
 
 
 @pytest.mark.slow(keep=("README", "quick_start"))

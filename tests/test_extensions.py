@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import count
 
 import numpy as np
 import pytest
 import shapely
+from registries import restored
 
 import foveasim as fs
 from foveasim.distortion import LENSES
@@ -500,20 +502,16 @@ WRONG = [
 
 
 @pytest.fixture
-def add(monkeypatch):
+def add():
     """Return a function that registers an object as 'wrong' until the end of the test."""
-    changed = []
+    with ExitStack() as stack:
 
-    def register(registry, item, example, expected):
-        monkeypatch.setattr(registry, "_objects", dict(registry))
-        changed.append(registry)
-        registry.register("wrong", item, example=example, expected=expected)
-        return registry.kind
+        def register(registry, item, example, expected):
+            stack.enter_context(restored(registry))
+            registry.register("wrong", item, example=example, expected=expected)
+            return registry.kind
 
-    yield register
-    for registry in changed:
-        registry._examples.pop("wrong", None)
-        registry.version += 1
+        yield register
 
 
 @pytest.mark.parametrize(("registry", "item", "example", "expected", "message"), WRONG)
@@ -548,8 +546,8 @@ def test_correct_extension_passes(add, registry, item, example, expected):
     check_extension(add(registry, item, example, expected), "wrong")
 
 
-def test_layout_family_passes_its_example(monkeypatch):
-    monkeypatch.setattr(LAYOUTS, "_objects", dict(LAYOUTS))
+@restored(LAYOUTS)
+def test_layout_family_passes_its_example():
     layout_family(example={"side_um": 2.0})(single)
 
     check_extension("layout family", "single")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from reference.features import write_files
 from reference.own_effects import OWN_EFFECTS
+from registries import restored
 
 from foveasim.sensor.effects import EFFECTS
 
@@ -16,9 +17,16 @@ def files(tmp_path_factory):
     return directory
 
 
+@pytest.fixture(autouse=True, scope="module")
+def own_effects():
+    """Register the effects of a user."""
+    with restored(EFFECTS):
+        for name, effect in OWN_EFFECTS.items():
+            EFFECTS.register(name, effect)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def composed(monkeypatch, files):
-    """Register the effects of a user, in the directory of the files."""
-    monkeypatch.setattr(EFFECTS, "_objects", {**EFFECTS, **OWN_EFFECTS})
-    monkeypatch.setattr(EFFECTS, "version", EFFECTS.version + 1)
+    """Change to the directory of the files."""
     monkeypatch.chdir(files)

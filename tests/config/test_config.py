@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from registries import restored
 
 import foveasim as fs
 from foveasim._io.images import read_picture, write_picture
@@ -430,13 +431,9 @@ def test_schema_of_rules_knows_names(data, is_valid):
 
 
 def test_registered_rule_is_in_schema():
-    before = dict(fs.layout.RULES)
-    fs.layout.RULES.register("min_round", fs.layout.Rule("minimum roundness", "", lambda case: case.layout.area_um2))
-    try:
+    with restored(fs.layout.RULES):
+        fs.layout.RULES.register("min_round", fs.layout.Rule("roundness", "", lambda case: case.layout.area_um2))
         assert errors_of("rules", {"custom": {"min_round": 0.5}}) == []
-    finally:
-        fs.layout.RULES._objects = before
-        fs.layout.RULES.version += 1
     assert errors_of("rules", {"custom": {"min_round": 0.5}}) != []
 
 

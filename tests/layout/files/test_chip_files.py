@@ -11,6 +11,7 @@ from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from programs import run_programs
+from registries import restored
 
 import foveasim as fs
 from foveasim._core.rings import site_ids
@@ -180,8 +181,8 @@ def test_trench_of_array_is_one_array(tmp_path, extension):
     assert (tmp_path / f"a.{extension}").stat().st_size < 1300
 
 
-def test_layer_of_layout_has_any_polygons(bayer, tmp_path, monkeypatch):
-    monkeypatch.setattr(DERIVED_LAYERS, "_objects", dict(DERIVED_LAYERS))
+@restored(DERIVED_LAYERS)
+def test_layer_of_layout_has_any_polygons(bayer, tmp_path):
 
     @DERIVED_LAYERS.register("seal ring")
     @fs.layout.LayoutLayer
@@ -219,8 +220,8 @@ def test_invalid_trenches_are_rejected(tmp_path, layout, parameters, match):
 
 
 @pytest.mark.parametrize("shapes", [None, "x", [1.0], [shapely.Point(0, 0)], [shapely.LineString([(0, 0), (1, 1)])]])
-def test_layer_of_layout_requires_polygons(bayer, tmp_path, monkeypatch, shapes):
-    monkeypatch.setattr(DERIVED_LAYERS, "_objects", dict(DERIVED_LAYERS))
+@restored(DERIVED_LAYERS)
+def test_layer_of_layout_requires_polygons(bayer, tmp_path, shapes):
     DERIVED_LAYERS.register("frame", fs.layout.LayoutLayer(lambda _: shapes))
     with pytest.raises(ParameterError, match="derived layer 'frame' must return a sequence of shapely polygons"):
         bayer.write(tmp_path / "a.gds", layers={"photosite": 1, "frame": 2})
@@ -299,8 +300,8 @@ def test_filter_names_of_filter_set(bayer, tmp_path):
     assert (again.channel == bayer.channel).all()
 
 
-def test_registered_derived_layer_is_written(bayer, tmp_path, monkeypatch):
-    monkeypatch.setattr(DERIVED_LAYERS, "_objects", dict(DERIVED_LAYERS))
+@restored(DERIVED_LAYERS)
+def test_registered_derived_layer_is_written(bayer, tmp_path):
     DERIVED_LAYERS.register("contact", lambda layout, *, side_um=0.5: shapely.buffer(
         shapely.points(layout.centroid_um), 0.5 * side_um, cap_style="square"
     ))  # fmt: skip
@@ -347,8 +348,8 @@ def test_vanishing_derived_shape_names_site(tmp_path):
     assert caught.value.site_ids == (1,)
 
 
-def test_derived_layer_requires_polygon_per_site(bayer, tmp_path, monkeypatch):
-    monkeypatch.setattr(DERIVED_LAYERS, "_objects", dict(DERIVED_LAYERS))
+@restored(DERIVED_LAYERS)
+def test_derived_layer_requires_polygon_per_site(bayer, tmp_path):
     DERIVED_LAYERS.register("frame", lambda layout: layout.polygons()[:-1])
     with pytest.raises(
         ParameterError, match=r"derived layer 'frame' must return one polygon for each of the \d+ sites"

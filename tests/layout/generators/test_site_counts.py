@@ -9,6 +9,7 @@ from math import hypot
 
 import numpy as np
 import pytest
+from registries import restored
 
 import foveasim as fs
 from foveasim.config import read_layout
@@ -150,9 +151,8 @@ def test_bad_requests_are_explained(name, parameters, message):
         LAYOUTS[name](**parameters)
 
 
-def test_user_family_solves_for_parameter(monkeypatch):
-    monkeypatch.setattr(LAYOUTS, "_objects", dict(LAYOUTS))
-
+@restored(LAYOUTS)
+def test_user_family_solves_for_parameter():
     @layout_family(
         example={"n": 4},
         solve_for=(SolveFor(name="n", guess=lambda n_sites, _: n_sites**0.5),),
