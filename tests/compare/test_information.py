@@ -156,7 +156,7 @@ def test_information_of_squares_matches_closed_form(sigma_um, side_um, snr):
     assert bits.sum() == pytest.approx(gaussian_information_bits(signal, noise), rel=1e-2)
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("sigma_um", [1.0, 2.0, 5.0])
 @pytest.mark.parametrize(
     ("vertices_um", "tolerance"),

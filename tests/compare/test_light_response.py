@@ -64,7 +64,7 @@ EVERYTHING = {
 }
 
 
-@pytest.mark.slow(keep=("plain",))
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("keywords", "effects"),
     [({}, []), ({}, [ROW_NOISE]), (EVERYTHING, [ROW_NOISE])],

@@ -649,7 +649,7 @@ def test_palette_mask_gives_indices(tmp_path):
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow(keep=("1-data.zarr",))
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
 @pytest.mark.parametrize("workers", [1, 2])
 def test_stored_samples_equal_simulated_samples(name, workers, tmp_path):

@@ -390,6 +390,7 @@ def test_values_symmetric_about_zero_have_mtf():
     assert about_0.mtf == pytest.approx(plain.mtf, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_values_without_edge_raise():
     rng = np.random.default_rng(0)
     x, y = SQUARES.centroid_um[:, 0], SQUARES.centroid_um[:, 1]

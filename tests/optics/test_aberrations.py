@@ -322,7 +322,7 @@ def test_psf_is_exact_at_patch_centre(n_patches):
     np.testing.assert_allclose(power_map.data[0], reference.data[0], rtol=0.0, atol=0.02 * reference.data.max())
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("padding", "padding_cells"), [("reflect", None), ("edge", 0), ("zero", 30), ("reflect", 30), ("zero", None)]
 )

@@ -61,7 +61,7 @@ SPECTRA = {
 }
 
 
-@pytest.mark.slow(keep=4)
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("spectrum", SPECTRA.values(), ids=SPECTRA)
 @pytest.mark.parametrize(
     ("pitch_um", "changes"),

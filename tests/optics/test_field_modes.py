@@ -87,7 +87,7 @@ def test_all_modes_equal_patches_in_single_precision():
     np.testing.assert_allclose(replace(lens, field_modes=80).power_map(scene).data, patches, atol=1e-6 * patches.max())
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("padding", "precision", "tolerance"),
     [
@@ -231,6 +231,7 @@ def test_more_points_reach_the_tolerance():
     assert modes.displaced <= 0.01
 
 
+@pytest.mark.usefixtures("few_points")
 def test_modes_are_those_of_maps():
     modes = LENS.psf_modes(noise())
 

@@ -237,7 +237,7 @@ def test_bins_are_divided_by_their_width():
 # -- over the field ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("kind", "options", "changes"),
     [

@@ -297,7 +297,7 @@ def test_obstructed_pupil_conserves_flux(precision, tolerance):
     assert got / full == pytest.approx(Aperture(optics.pupil, [], 0.0).transmittance(550.0), rel=tolerance)
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_weighted_maps_equal_weighted_sum_of_maps(precision):
     rng = np.random.default_rng(1)

@@ -223,6 +223,7 @@ def test_large_charges_without_noise_equal_sums(mean_e, dn_per_e):
     assert_equals_sums(sensor_at(dn_per_e), [mean_e])
 
 
+@pytest.mark.slow(keep=4)
 @pytest.mark.parametrize("companding", ["root", "log"])
 @pytest.mark.parametrize("sigma_e", [0.0, 0.3, 1.0, 1.1, 1.5, 2.5])
 def test_companded_prediction_equals_integer_sums(companding, sigma_e):

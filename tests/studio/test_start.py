@@ -51,7 +51,7 @@ def test_all_bundled_generators_have_templates():
     assert set(generators()) == set(fs.layout.LAYOUTS.within("foveasim.layout.generators"))
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("n_sites", [1000, 4000])
 @pytest.mark.parametrize("generator", generators())
 def test_template_fills_its_format(recorder, generator, n_sites):

@@ -135,6 +135,7 @@ def test_concave_sites_are_single_cells():
     assert layout[[1, 2, 4, 5]].to_pyvista().n_cells == 4
 
 
+@pytest.mark.slow
 @pytest.mark.needs("renderer")
 def test_pyvista_fills_concave_cells_exactly():
     renderer.begin_rendering()

@@ -488,6 +488,7 @@ def test_relaxed_centres_have_blue_noise_spacing():
     assert nearest_um(layout.centroid_um).min() > 0.7 * math.sqrt(2 / math.sqrt(3))
 
 
+@pytest.mark.slow
 def test_cone_mosaic_has_published_spacing():
     """249,800 cones/mm² correspond to a spacing of 2.15 µm in hexagonal packing."""
     n_sites = round(249_800e-6 * 100.0 * 80.0)
@@ -1057,6 +1058,7 @@ def test_provenance_reproduces_density_driven_sites():
     assert_same(voronoi(**layout.provenance["parameters"]), layout)
 
 
+@pytest.mark.slow
 def test_provenance_reproduces_equal_capacity_sites():
     layout = voronoi(n_sites=30, region=STAR, n_iterations=2, capacity="equal", seed=7)
 

@@ -235,7 +235,7 @@ def test_linear_polar_fovea_uses_outer_sectors():
     assert np.all(layout.readout_line[inside] % (48 // n_sites[layout.columns["ring"][inside]]) == 0)
 
 
-@pytest.mark.slow(keep=2)
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("fovea", "chords_per_arc"),
     [("rings", 1), ("rings", 4), ("linear", 2), ("linear", 7), ("hexagons", 1), ("hexagons", 2), ("hexagons", 3)],
