@@ -222,6 +222,7 @@ GUARDED = {
 }
 
 
+@pytest.mark.slow
 def test_optional_modules_are_imported_with_install_hint():
     found = {
         str(path.relative_to(PACKAGE))

@@ -79,7 +79,7 @@ def message(kind, settings):
     return None
 
 
-@pytest.mark.slow(keep=1)
+@pytest.mark.slow(keep=("rules",))
 @pytest.mark.parametrize("kind", FILES)
 def test_wrong_values_give_one_line(kind):
     found = [(key, message(kind, settings)) for key, settings in wrong_settings(kind)]
