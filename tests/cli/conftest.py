@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import warnings
@@ -14,8 +15,13 @@ from foveasim._io.terminal import PlainConsole
 
 
 def run_here(patch, read, *arguments, cwd, **environment):
-    """Run the program in a directory; return exit code, standard output and standard error, as of a wide terminal."""
+    """
+    Run the program in a directory; return exit code, standard output and standard error, as of a wide terminal.
+
+    Modules of the directory, such as those of metrics, are forgotten.
+    """
     read()
+    known = set(sys.modules)
     with patch.context() as here, warnings.catch_warnings():
         warnings.simplefilter("default")
         here.chdir(cwd)
@@ -27,6 +33,9 @@ def run_here(patch, read, *arguments, cwd, **environment):
         here.setattr(cli, "error_console", PlainConsole(stderr=True))
         with pytest.raises(SystemExit) as ended:
             cli.main()
+    for name in set(sys.modules) - known:
+        if (getattr(sys.modules[name], "__file__", None) or "").startswith(f"{cwd}{os.sep}"):
+            del sys.modules[name]
     printed = read()
     return subprocess.CompletedProcess(arguments, ended.value.code or 0, printed.out, printed.err)
 

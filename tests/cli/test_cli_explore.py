@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from cli.conftest import run_here
 from PIL import Image
 from waiting import DEADLINE_S, wait_until
 
-from foveasim import cli, explore
+from foveasim import explore
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, FileError, SimulationError
 from foveasim.explore import _records
@@ -124,13 +125,8 @@ def foveasim(folder, monkeypatch, capsys):
     """Run the program in this process: exit code, standard output, standard error."""
 
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["foveasim", *map(str, arguments)])
-        monkeypatch.setattr(sys, "path", list(sys.path))
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        said = capsys.readouterr()
-        return ended.value.code or 0, said.out, said.err
+        ended = run_here(monkeypatch, capsys.readouterr, *map(str, arguments), cwd=folder)
+        return ended.returncode, ended.stdout, ended.stderr
 
     return run
 
@@ -312,7 +308,6 @@ def test_study_interrupted_twice_resumes_identically(foveasim, folder, monkeypat
     assert n_stop < n_begun(folder / "study.db") < 24
 
     (folder / "held").unlink()
-    monkeypatch.delitem(sys.modules, "own", raising=False)  # of another test
     code, _, said = foveasim("study", "slow.yaml", "--metric", "own:patient")
     found = stored(folder / "study.db")
 

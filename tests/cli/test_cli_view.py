@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli.conftest import run_here
 from waiting import DEADLINE_S, wait_until
 
 import foveasim as fs
-from foveasim import cli
 from foveasim.errors import ParameterError
 from foveasim.view.web import open_page, serve_page
 
@@ -32,11 +32,8 @@ def view(folder, monkeypatch, capsys):
     """Run the command in this process: exit code, standard output, standard error."""
 
     def run(*arguments):
-        monkeypatch.chdir(folder)
-        monkeypatch.setattr(sys, "argv", ["foveasim", "view", *arguments])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        return (end.value.code or 0, *capsys.readouterr())
+        ended = run_here(monkeypatch, capsys.readouterr, "view", *arguments, cwd=folder)
+        return ended.returncode, ended.stdout, ended.stderr
 
     return run
 
@@ -244,16 +241,15 @@ def ask(port, host=None, first="GET / HTTP/1.1", more=""):
 
 
 def test_served_page_survives_clients_that_reset(served_port):
-    port = served_port
     for n_bytes in (0, 1, 100_000):
         for _ in range(5):
-            connection = connect(port, f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n")
+            connection = connect(served_port, f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{served_port}\r\n\r\n")
             if n_bytes:
                 connection.recv(n_bytes)
             # Close with a TCP reset.
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             connection.close()
-    head, _, body = ask(port).partition(b"\r\n\r\n")
+    head, _, body = ask(served_port).partition(b"\r\n\r\n")
 
     assert head.startswith(b"HTTP/1.1 200 OK\r\n")
     assert len(body) == BIG_BYTES
