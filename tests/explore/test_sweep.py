@@ -17,9 +17,10 @@ from functools import cache
 
 import numpy as np
 import pytest
+from cli.conftest import run_here
 from waiting import DEADLINE_S, has_ended, wait_until
 
-from foveasim import cli, explore
+from foveasim import explore
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, FileError, ParameterError, SimulationError
 from foveasim.explore._records import Journal, Record, journal_path, to_values
@@ -265,19 +266,19 @@ def programs(n_workers):
 
 @pytest.fixture(scope="module")
 def scheduler():
-    with programs(2) as started:
-        yield started
+    with programs(2) as (address, _):
+        yield address
 
 
 @pytest.fixture(scope="module")
 def scheduler_of_one_worker():
-    with programs(1) as started:
-        yield started
+    with programs(1) as (address, _):
+        yield address
 
 
 @pytest.mark.slow
 def test_results_are_equal_on_external_scheduler(scheduler, reference_results):
-    found = explore.run_sweep(plan_120(), scheduler=scheduler[0])
+    found = explore.run_sweep(plan_120(), scheduler=scheduler)
 
     assert_identical(found, reference_results)
 
@@ -290,7 +291,7 @@ def where(request):
         yield {"workers": n_workers}
     else:
         fixture = {1: "scheduler_of_one_worker", 2: "scheduler"}[n_workers]
-        yield {"scheduler": request.getfixturevalue(fixture)[0]}
+        yield {"scheduler": request.getfixturevalue(fixture)}
 
 
 @pytest.mark.slow
@@ -352,7 +353,7 @@ def test_worker_cache_uses_quarter_of_memory(scheduler):
         _, runner = shared.function().args
         return runner.cache.max_bytes
 
-    found = explore.sweep(SHOT, {"sensor.bits": [8]}, metrics=[cache_bytes], scheduler=scheduler[0])
+    found = explore.sweep(SHOT, {"sensor.bits": [8]}, metrics=[cache_bytes], scheduler=scheduler)
 
     assert found["cache_bytes"].item() == 500_000_000
 
@@ -417,22 +418,22 @@ def test_pause_of_all_workers_is_reported(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_scheduler_is_reported_with_journal(scheduler, tmp_path):
-    """Runs last with this scheduler, which it kills."""
-    address, program = scheduler
+def test_killed_scheduler_is_reported_with_journal(tmp_path):
     store = tmp_path / "r.zarr"
+    plan = plan_120(logging_metric(tmp_path, SLOW_S, journal_path(store)))
     (tmp_path / "held").write_text("6")
 
-    def kill():
+    def kill(program):
         wait_until(lambda: len(journal_points(store)) >= 5)
         program.kill()
         (tmp_path / "held").unlink()
 
-    killer = threading.Thread(target=kill)
-    killer.start()
-    with pytest.raises(SimulationError, match=r"the scheduler no longer answers; \d+ of 120 points are done"):
-        explore.run_sweep(plan_120(logging_metric(tmp_path, SLOW_S, journal_path(store))), out=store, scheduler=address)
-    killer.join()
+    with programs(1) as (address, program):
+        killer = threading.Thread(target=kill, args=(program,))
+        killer.start()
+        with pytest.raises(SimulationError, match=r"the scheduler no longer answers; \d+ of 120 points are done"):
+            explore.run_sweep(plan, out=store, scheduler=address)
+        killer.join()
 
     assert len(journal_points(store)) >= 5
 
@@ -557,7 +558,7 @@ def interrupt(number, directory, n_points):
 
 
 @pytest.mark.slow
-def test_interrupted_sweep_resumes_without_repetition(directory, monkeypatch):
+def test_interrupted_sweep_resumes_without_repetition(directory, monkeypatch, capsys):
     code, printed, after_stop = interrupt(signal.SIGINT, directory, 10)
     n_stop = len(executions(directory))
 
@@ -575,16 +576,9 @@ def test_interrupted_sweep_resumes_without_repetition(directory, monkeypatch):
     assert after_kill[: len(after_stop)] == after_stop
     assert len(after_stop) < len(after_kill) < 60
 
-    # The rest in this process.
-    monkeypatch.chdir(directory)
-    monkeypatch.setattr(sys, "argv", ["foveasim", *COMMAND, "0"])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setitem(sys.modules, "own", None)
-    del sys.modules["own"]
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
+    ended = run_here(monkeypatch, capsys.readouterr, *COMMAND, "0", cwd=directory)
 
-    assert not ended.value.code
+    assert ended.returncode == 0, ended.stderr
     assert not journal_path(directory / "results.zarr").exists()
     found = explore.open_results(directory / "results.zarr")
     assert (found["error"] == "").all()
@@ -1208,16 +1202,12 @@ def test_sweep_file_imports_no_code(directory, monkeypatch, capsys):
     (directory / "untrusted.py").write_text(f"open({str(directory / 'imported')!r}, 'w')")
     sweep = {"shot": "shot.yaml", "vary": {"sensor.bits": [8]}, "metrics": ["untrusted:metric"]}
     (directory / "bad.yaml").write_text(json.dumps(sweep))
-    monkeypatch.chdir(directory)
     monkeypatch.syspath_prepend(directory)
-    monkeypatch.setattr(sys, "argv", ["foveasim", "sweep", "bad.yaml"])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    printed = capsys.readouterr().err
+    ended = run_here(monkeypatch, capsys.readouterr, "sweep", "bad.yaml", cwd=directory)
 
-    assert ended.value.code == 2
-    assert "'metrics' must be names of metrics" in printed
-    assert len(printed.splitlines()) == 1
+    assert ended.returncode == 2
+    assert "'metrics' must be names of metrics" in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
     assert not (directory / "imported").exists()
 
 
