@@ -53,7 +53,8 @@ SCENE_ARGUMENTS: dict[str, dict[str, Any]] = {
     "bars": CHART | RADIANCE | {"groups": [1, 2, 3]},
     "letter_f": CHART | GREY | {"height_mm": 15.0},
     "grey_scale": CHART | RADIANCE | {"patch_mm": 4.0},
-    "colour_chart": CHART | {"patch_mm": 6.0, "radiance_w_m2_sr_nm": 0.02},
+    "colour_chart": CHART
+    | {"patch_mm": 6.0, "radiance_w_m2_sr_nm": 0.02, "wavelength_nm": [430.0, 490.0, 550.0, 610.0, 670.0]},
     "point_grid": CHART | POINTS | {"spacing_mm": 16.0 * PITCH_UM / 1e3, "intensity_w_sr_nm": 1e-5},
     "sine": CHART | RADIANCE | {"line_pairs_per_mm": 0.1, "angle_deg": 20.0},
     "zone_plate": CHART | GREY | {"line_pairs_per_mm": 0.2},
