@@ -94,6 +94,13 @@ def pytest_collection():
         gc.enable()
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish():
+    """Collect garbage once: pytest does so five times afterwards, among all modules and tests, and would find the same."""
+    gc.collect()
+    gc.freeze()
+
+
 def needs(item):
     """Return the requirements of a test."""
     return [what for marker in item.iter_markers("needs") for what in marker.args]
