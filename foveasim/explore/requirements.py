@@ -175,9 +175,7 @@ def _function(name: str) -> Callable[[_Measure], _Measure]:
 
 @_function("snr")
 def _snr(shot: Shot, capture: Capture, _result: RegionResult, sites: NDArray[np.intp]) -> float:
-    ratio, is_saturated = signal_to_noise_of(shot, shot.camera, capture)
-    used = ratio[sites][~is_saturated[sites]]
-    return float(np.median(used)) if used.size else float("nan")
+    return float(np.median(signal_to_noise_of(shot, shot.camera, capture)[sites]))
 
 
 @_function("snr_db")

@@ -141,7 +141,9 @@ def search_value(
         value = min(max(round(value), math.ceil(low)), math.floor(high)) if is_integer else float(f"{value:.6g}")
         if value not in results:
             try:
-                results[value] = float(result_at(value))
+                result = float(result_at(value))
+                # No signal, or saturation: a jump to 0 is no crossing of a limit, and the largest results are next to it.
+                results[value] = math.nan if result == 0.0 and requirement.measure == "snr" else result
             except FoveasimError as error:  # such as a generator without sites: the other values may be valid
                 problems.append(str(error))
                 results[value] = math.nan

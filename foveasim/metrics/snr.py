@@ -61,8 +61,7 @@ class SnrTable:
         Square root of the mean temporal variance, including quantisation.
     saturated_fraction : (n_class,) float64
         Fraction of sites with clipped noise: the mean charge is within two standard deviations of its shot noise of the full
-        well, or the mean code is within two standard deviations of the highest code. Predictions for such sites have the SNR
-        at saturation; a measured SNR is too high.
+        well, or the mean code is within two standard deviations of the highest code.
     """
 
     classes: NDArray[Any]
@@ -78,11 +77,12 @@ class SnrTable:
     @property
     def snr(self) -> Floats:
         """
-        Signal over noise, (n_class,).
+        Signal over noise, (n_class,), of which saturated sites contribute 0: times the fraction of the others.
 
-        It is at most the square root of the signal in electrons, except for a measurement at saturation.
+        It is at most the square root of the signal in electrons.
         """
-        return np.divide(self.signal_dn, self.noise_dn, out=np.zeros_like(self.signal_dn), where=self.noise_dn > 0.0)
+        ratio = np.divide(self.signal_dn, self.noise_dn, out=np.zeros_like(self.signal_dn), where=self.noise_dn > 0.0)
+        return (1.0 - self.saturated_fraction) * ratio
 
     @property
     def snr_db(self) -> Floats:
@@ -380,31 +380,41 @@ def measured_snr_by_class(
     [30.0]
     """
     captures = frames if isinstance(frames, Sequence) and all(isinstance(frame, Capture) for frame in frames) else ()
+    sensor_settings = _common_settings(captures)
     if bits is None:
-        first = frames[0] if isinstance(frames, Sequence) and len(frames) else None
-        bits = getattr(first, "bits", None)
-        if bits is None:
+        if not captures:
             raise ParameterError("bits", "must be given for frames that are not captures")
+        bits = captures[0].bits
     codes, dark_codes = codes_of("frames", frames), codes_of("dark", dark)
     for name, some in (("frames", codes), ("dark", dark_codes)):
         if some.shape[1] != layout.n_sites:
             raise ParameterError(name, f"must have the {layout.n_sites} sites of the layout", some.shape[1])
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
     is_saturated = _is_near(codes.mean(axis=0), codes.var(axis=0, ddof=1), 2**bits - 1.5)
-    well_e = _full_well_e(captures, full_well_e, layout.n_sites)
+    well_e = _full_well_e(sensor_settings, full_well_e, layout.n_sites)
     if well_e is not None:
         mean_e = np.mean([capture.electrons for capture in captures], axis=0)
         is_saturated |= _is_near(mean_e, mean_e, well_e)
-    adc = _build_adc(captures, bits)
+    adc = _build_adc(sensor_settings or {}, bits)
     linear_dn, dark_dn = (np.interp(some, np.arange(2.0**bits), adc.linear_dn) for some in (codes, dark_codes))
     floor_dn2 = QUANTISATION_DN2 * np.square(adc.width_of_code_dn(codes.mean(axis=0)))
     noise_dn2 = np.maximum(linear_dn.var(axis=0, ddof=1), floor_dn2)
     return _table(groups, layout.area_um2, linear_dn.mean(axis=0) - dark_dn.mean(axis=0), noise_dn2, is_saturated)
 
 
-def _build_adc(captures: Sequence[Capture], bits: int) -> ADC:
-    """Return the ADC specified by the settings of the captures, or a linear one."""
-    settings = captures[0].settings.get("sensor", {}) if captures else {}
+def _common_settings(captures: Sequence[Capture]) -> Mapping[str, Any] | None:
+    """Return the settings of the sensor of captures, None without captures."""
+    if not captures:
+        return None
+    first, *others = ((capture.bits, dict(capture.settings.get("sensor", {}))) for capture in captures)
+    for k, other in enumerate(others, 1):
+        if other != first:
+            raise ParameterError("frames", f"must be captures of one sensor: the settings of captures 0 and {k} differ")
+    return first[1]
+
+
+def _build_adc(settings: Mapping[str, Any], bits: int) -> ADC:
+    """Return the ADC specified by the settings of a sensor, or a linear one."""
     names = ("companding", "log_strength", "companding_table", "inl_dn")
     return ADC(bits=bits, **{name: settings[name] for name in names if name in settings})
 
@@ -414,19 +424,19 @@ def _sensor_and_layout(camera: Camera) -> tuple[Sensor, Layout]:
     return camera.sensor, camera.sensor.layout
 
 
-def _full_well_e(captures: Sequence[Capture], full_well_e: ArrayLike | None, n_sites: int) -> Floats | None:
-    """Return the full well capacity, one or (n_site,); None if unlimited or without captures."""
+def _full_well_e(settings: Mapping[str, Any] | None, full_well_e: ArrayLike | None, n_sites: int) -> Floats | None:
+    """Return the full well capacity, one or (n_site,); None if unlimited or without the settings of captures."""
     if full_well_e is None:
-        if not captures:
+        if settings is None:
             return None
-        full_well_e = captures[0].settings.get("sensor", {}).get("full_well_e")
+        full_well_e = settings.get("full_well_e")
         if isinstance(full_well_e, Mapping):
             raise ParameterError(
                 "full_well_e", "must be given, because the settings of the captures do not contain it for every site"
             )
         if full_well_e is None:
             return None
-    elif not captures:
+    elif settings is None:
         raise ParameterError(
             "full_well_e", "must not be given without captures; codes alone do not determine the charge"
         )

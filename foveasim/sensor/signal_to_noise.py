@@ -51,6 +51,15 @@ class SiteSignals:
         """Signal-to-noise ratio, (n_site,); 0 for sites without noise."""
         return np.divide(self.signal_e, self.noise_e, out=np.zeros_like(self.signal_e), where=self.noise_e > 0.0)
 
+    @property
+    def unsaturated_ratio(self) -> Floats:
+        """
+        Signal-to-noise ratio of sites that measure light, (n_site,); 0 for saturated ones.
+
+        Means and medians over sites use it, so that a result does not improve when more sites saturate.
+        """
+        return np.where(self.is_saturated, 0.0, self.ratio)
+
 
 def signal_to_noise(
     sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike, *, exposure_s: Annotated[float | None, EXPOSURE] = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from foveasim._core.validation import Bools, Floats
+from foveasim._core.validation import Floats
 from foveasim.camera import Camera
 from foveasim.capture import Capture
 from foveasim.config import Shot
@@ -14,12 +14,11 @@ from foveasim.sensor import signal_to_noise
 __all__ = ["signal_to_noise_of", "snr"]
 
 
-def signal_to_noise_of(shot: Shot, camera: Camera, capture: Capture) -> tuple[Floats, Bools]:
-    """Return the ratio of signal to temporal noise of each site, and whether it is saturated."""
+def signal_to_noise_of(shot: Shot, camera: Camera, capture: Capture) -> Floats:
+    """Return the ratio of signal to temporal noise of each site; 0 for saturated ones."""
     sensor = camera.sensor
     dark_e = sensor.expected_electrons(np.zeros(sensor.layout.n_sites), shot.exposure_s)
-    found = signal_to_noise(sensor, capture.expected_e, dark_e, exposure_s=shot.exposure_s)
-    return found.ratio, found.is_saturated
+    return signal_to_noise(sensor, capture.expected_e, dark_e, exposure_s=shot.exposure_s).unsaturated_ratio
 
 
 @METRICS.register("snr")
@@ -27,11 +26,7 @@ def snr(shot: Shot, camera: Camera, capture: Capture) -> dict[str, float]:
     """
     Compute the mean and median signal-to-noise ratio of the sites analytically.
 
-    The ratio is that of :func:`foveasim.sensor.signal_to_noise`: signal over temporal noise. Saturated sites are excluded; the
-    result is NaN when all sites are saturated.
+    The ratio is that of :func:`foveasim.sensor.signal_to_noise`: signal over temporal noise. That of a saturated site is 0.
     """
-    all_ratios, is_saturated = signal_to_noise_of(shot, camera, capture)
-    ratio = all_ratios[~is_saturated]
-    if not ratio.size:
-        return {"mean": float("nan"), "median": float("nan")}
+    ratio = signal_to_noise_of(shot, camera, capture)
     return {"mean": float(ratio.mean()), "median": float(np.median(ratio))}
