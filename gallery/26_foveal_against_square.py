@@ -43,8 +43,9 @@ def draw(found: fs.compare.Comparison) -> Figure:
     figure = Figure(figsize=(8.0, 5.6), layout="constrained")
     axes = figure.subplots(2, 3)
     scene = found.scenes.index("astronaut")
-    white = np.nanquantile(found.ideal[scene].data, 0.995)
-    pictures = {"ideal": found.ideal[scene]} | {
+    ideal = found.ideals["square"][scene]
+    white = np.nanquantile(ideal.data, 0.995)
+    pictures = {"ideal": ideal} | {
         f"{name}: {budget.n_sites:,} sites": found.pictures[name][scene]
         for name, budget in zip(found.names, found.budgets, strict=True)
     }

@@ -29,11 +29,10 @@ from foveasim.camera._colour import colour_correction
 from foveasim.camera._exposure import AUTO_SETTINGS, ExposureTime, exposure_time
 from foveasim.camera._footprints import FootprintCache, find_footprints, find_incidence, placed
 from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
+from foveasim.camera._framing import axis_of, common_bounds_um, fit_scene
 from foveasim.camera._steps import SensorFrame, WeightedMap, expose, integrate_maps, white_dn
 from foveasim.camera._warnings import (
     Covered,
-    format_point,
-    size_um,
     warn_of_coarse_cells,
     warn_of_coarse_pixels,
     warn_of_coverage,
@@ -59,10 +58,6 @@ from foveasim.units import um_from_nm, w_from_w_m2_um2
 
 #: Quantity that the optical axis is fixed to when the gaze moves: see :class:`Camera`.
 GazeAxis = Literal["image", "sensor"]
-#: Distance of the centre of a layout from its origin, relative to its size, that counts as rounding.
-CENTRE_ROUNDING = 1e-9
-#: Margin of a picture that covers undistorted outlines: their edges are curves of limited accuracy.
-COVER_MARGIN = 1e-5
 #: Exposures that exceed the time between them by this fraction do so by rounding.
 TIME_ROUNDING = 1e-9
 #: Number of compiled layouts in the cache, per grid of one image.
@@ -233,12 +228,12 @@ class Camera:
         cell_um = self._optics.grid(light).pitch_x_um / self.oversample(light)
         return 2 if cell_um <= SMOOTH_LAMBDA_N * narrowest_um else 1
 
-    def frame(self, scene: Scene) -> Scene:
+    def frame(self, scene: Scene, *, others: Iterable[Camera] = ()) -> Scene:
         """
         Return a scene with the pixel pitch that its ``fit`` requires with this camera.
 
         Captures and all other results of the camera frame their scenes; this method shows the pitch, or prepares a scene for
-        functions without a camera, such as :meth:`Optics.power_map`.
+        functions without a camera, such as :meth:`Optics.power_map`, or for several cameras.
 
         Parameters
         ----------
@@ -249,27 +244,47 @@ class Camera:
             there requires a larger picture to be covered, and contains a smaller one; outlines are undistorted first, and
             sites outside the image circle do not count. With lateral chromatic aberration, the condition holds for all
             wavelengths. The gaze is not considered, but ``gaze_range_um`` of the scene enlarges the box.
+        others : iterable of Camera
+            With the same optics and distortion. The bounding box is then that of all layouts, and all cameras have the same
+            image of the returned scene: pass it to each, instead of the scene, to compare them.
 
         Returns
         -------
         Scene
-            With ``pitch_um``; the scene itself if it has a pitch.
+            With ``pitch_um`` and its optical axis; the scene itself if it has a pitch.
 
         Raises
         ------
         ParameterError
             When the layout has no photosites in the image circle, or for ``"contain"`` the optical axis is outside its
-            bounding box; when the distance of the scene is at most the focal length.
+            bounding box; when the distance of the scene is at most the focal length, or when the cameras have different lenses.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
+        >>> wide, high = (fs.layout.grid(n_x=n, n_y=60 - n, pitch_um=1.0) for n in (40, 20))
+        >>> cameras = [fs.Camera(optics=optics, sensor=fs.Sensor(layout)) for layout in (wide, high)]
+        >>> scene = fs.Scene.from_picture(np.ones((10, 10)), fit="cover", distance_m=1.0, illuminance_lux=500.0)
+        >>> framed = cameras[0].frame(scene, others=cameras[1:])
+        >>> [round(camera.image_grid(framed).bounds_um[2], 6) for camera in cameras]
+        [20.0, 20.0]
         """
         if scene.pitch_um is not None:
             return scene
+        cameras = [self, *others]
+        if len(cameras) > 1:
+            return fit_scene(scene, self._optics, self._distortion, common_bounds_um(cameras, str(scene.fit)))
         framed = self._framed
         if framed is None or framed[0] is not scene:
-            self._framed = framed = scene, self._fit(scene)
+            bounds_um = common_bounds_um(cameras, str(scene.fit))
+            self._framed = framed = scene, fit_scene(scene, self._optics, self._distortion, bounds_um)
         return framed[1]
 
-    def _layout_bounds_um(self) -> Floats:
-        """Return the bounds of the undistorted outlines, (4,) µm; NaN without any."""
+    @property
+    def layout_bounds_um(self) -> Floats:
+        """Bounds of the undistorted outlines, (4,) µm; NaN without any in the image circle."""
         if not self._bounds_um:
             self._bounds_um.append(outline_bounds_um(self._layout, self._distortion))
         return np.array(self._bounds_um[0])
@@ -278,41 +293,8 @@ class Camera:
         """Return the optical axis and the scales of the image of a scene."""
         if self._distortion is not None or scene.fit is None:
             return SensorFrame.of(self._distortion)
-        bounds_um = self._layout_bounds_um()
-        centre_um = 0.5 * (bounds_um[:2] + bounds_um[2:])
-        is_centred = np.abs(centre_um) <= CENTRE_ROUNDING * (bounds_um[2:] - bounds_um[:2])
-        x_um, y_um = np.where(is_centred, 0.0, centre_um).tolist()
-        return SensorFrame.of(None, (x_um, y_um))
-
-    def _fit(self, scene: Scene) -> Scene:
-        """Return a scene with the pitch of its framing."""
-        fit, bounds_um = scene.fit, self._layout_bounds_um()
-        if np.isnan(bounds_um).any():
-            required = "photosites in the image circle" if self._layout.n_sites else "photosites"
-            raise ParameterError("fit", f"must be used with a layout that has {required}", fit)
-        frame = self.sensor_frame(scene)
-        axis_um, range_um = np.array(frame.axis_um), np.array(scene.gaze_range_um)
-        below_um, above_um = axis_um - bounds_um[:2] + range_um, bounds_um[2:] - axis_um + range_um
-        # The image scales with the pitch. At this one its pixels are of about 1 µm.
-        unit_um = 1.0 / self._optics.magnification(scene.distance_m)
-        one = scene.framed(unit_um)
-        images = [self._optics.grid(one)] if fit == "width" else [grid for grid, _ in self._optics.image_grids(one)]
-        half_um = 0.5 * np.array([size_um(frame.image(grid).bounds_um) for grid in images])
-        if fit == "width":
-            scale = 0.5 * (below_um + above_um)[0] / half_um[0, 0]
-        elif fit == "cover":
-            margin = 0.0 if self._distortion is None else COVER_MARGIN
-            scale = (1.0 + margin) * (np.maximum(below_um, above_um) / half_um.min(axis=0)).max()
-        else:
-            scale = (np.minimum(below_um, above_um) / half_um.max(axis=0)).min()
-            if not scale > 0.0:
-                raise ParameterError(
-                    "fit",
-                    f"must not be 'contain' with the optical axis, at {format_point(axis_um)} µm, outside the layout, which "
-                    f"extends from {format_point(bounds_um[:2])} to {format_point(bounds_um[2:])} µm; use 'cover' or "
-                    "'width', or move the layout",
-                )
-        return scene.framed(float(scale) * unit_um)
+        axis_um = scene.axis_um
+        return SensorFrame.of(None, axis_of(self.layout_bounds_um) if axis_um is None else axis_um)
 
     def _with_pitch(self, light: Scene | PowerMap) -> Scene | PowerMap:
         """Return a scene with its pitch, or a power map."""
@@ -1043,7 +1025,7 @@ class Camera:
             covered = Covered.by(smallest)
             if footprints is not None and footprints.outlines is not None:
                 layout = placed(self._layout, None, position_um)
-                bounds_um = (self._layout_bounds_um() + np.tile(position_um, 2)).tolist()
+                bounds_um = (self.layout_bounds_um + np.tile(position_um, 2)).tolist()
                 covered = Covered.of(layout, bounds_um, smallest.grid, self._distortion, self._n_threads)
         named_um = None if moving_um is None and not any(gaze_um) else gaze_um
         warn_of_coverage(source, covered, self._layout.n_sites, named_um, warned)

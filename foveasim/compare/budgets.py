@@ -96,19 +96,19 @@ def check_equal_budgets(budgets: Mapping[str, Budget], budget: str | None, toler
     Check that cameras have the same budget.
 
     ``budget`` ({"n_sites", "data_rate", "readout_time", "area", "read_noise"} or None): the budget to compare; None for no
-    check. ``tolerance``: largest relative difference from the first camera. Raises ParameterError when the budget of a camera
-    differs by more.
+    check. ``tolerance``: largest difference of two cameras, relative to the smaller budget. Raises ParameterError when the
+    smallest and the largest budget differ by more.
     """
     if budget is None:
         return
     attribute, title, unit = BUDGETS[check_choice("budget", budget, tuple(BUDGETS))]
-    (first, reference), *others = ((name, getattr(found, attribute)) for name, found in budgets.items())
-    for name, value in others:
-        if abs(value - reference) > tolerance * abs(reference):
-            shown = [format_quantity(number, unit, digits=6) for number in (reference, value)]
-            raise ParameterError(
-                "budget",
-                f"must be equal within {100.0 * tolerance:g} %: the {title} of {format_value(first)} is {shown[0]}, "
-                f"that of {format_value(name)} {shown[1]}",
-                hint="use layouts of equal budget (n_sites= of a generator), a larger tolerance, or no budget",
-            )
+    found = {name: getattr(one, attribute) for name, one in budgets.items()}
+    low, high = min(found, key=found.__getitem__), max(found, key=found.__getitem__)
+    if found[high] - found[low] > tolerance * found[low]:
+        shown = [format_quantity(found[name], unit, digits=6) for name in (low, high)]
+        raise ParameterError(
+            "budget",
+            f"must be equal within {100.0 * tolerance:g} %: the {title} of {format_value(low)} is {shown[0]}, "
+            f"that of {format_value(high)} {shown[1]}",
+            hint="use layouts of equal budget (n_sites= of a generator), a larger tolerance, or no budget",
+        )

@@ -37,11 +37,11 @@ from foveasim.errors import ParameterError, format_value
 from foveasim.fields import Grid, PowerMap
 from foveasim.layout import Layout
 from foveasim.optics import Optics
-from foveasim.reconstruct import Picture
+from foveasim.reconstruct import Picture, reference
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor
 from foveasim.sensor.model.linearisation import Linearisation
-from foveasim.units import per_mm_from_per_um
+from foveasim.units import per_mm_from_per_um, photon_energy_j, w_from_w_m2_um2
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -85,7 +85,9 @@ class Comparison:
     compared_fraction : float
         Fraction of the field that all cameras cover: pictures are compared there.
     pictures : mapping of str to list of Picture
-        Pictures of each camera for each scene, with the gain that was fitted; those of ``ideal`` are the references.
+        Pictures of each camera for each scene, photons/µm², with the gain that was fitted.
+    ideals : mapping of str to list of Picture
+        Their references: the ideal image of each camera on the same grid. They differ between gazes and spectral responses.
     sizes : mapping of str to list of dict
         Size classes of each camera: size in µm, number of sites, area fraction.
     settings : mapping
@@ -101,7 +103,7 @@ class Comparison:
     coverage_fraction: Floats
     compared_fraction: float
     pictures: Mapping[str, Sequence[Picture]]
-    ideal: Sequence[Picture]
+    ideals: Mapping[str, Sequence[Picture]]
     sizes: Mapping[str, Sequence[Mapping[str, Any]]]
     settings: Mapping[str, Any]
 
@@ -311,7 +313,7 @@ def cameras(
     budget : {"n_sites", "data_rate", "readout_time", "area", "read_noise"} or None
         Budget that must be equal; None for any budgets.
     tolerance : float
-        Largest relative difference of the budgets from that of the first camera.
+        Largest difference between two budgets, relative to the smaller one.
     frames_per_s : float, or mapping of str to float, optional, 1/s
         Frame rate for the data rate, of all cameras or by name; by default one frame per exposure.
     centre_um : (x, y), µm
@@ -335,8 +337,12 @@ def cameras(
 
     Notes
     -----
-    The reference of a picture is the ideal image on its grid: exact means of the irradiance, with the spectral response of the
-    camera. One gain per picture is fitted. Pictures are compared where all cameras cover at least half of a pixel.
+    Scenes with ``fit`` are framed once, on the bounding box of all layouts, so that all cameras have the same image and the
+    results do not depend on their order.
+
+    The reference of a picture is the ideal image on its grid: exact means of the irradiance, with the spectral response and the
+    gaze of its camera. One gain per picture is fitted. Pictures are compared where all cameras cover at least half of a pixel.
+    The covariance of the scenes is that of the photons in the part of the image that any camera sees.
 
     Examples
     --------
@@ -354,74 +360,80 @@ def cameras(
     fixation: tuple[float, float] = tuple(finite_array("centre_um", centre_um).tolist())
     budgets = {name: budget_of(camera, _rate(frames_per_s, name, exposure_s)) for name, camera in named.items()}
     check_equal_budgets(budgets, budget, tolerance)
+    first = next(iter(named.values()))  # its lens is that of all cameras
     all_layouts = [camera.layout for camera in named.values()]
-    first_name, first = next(iter(named.items()))
     if scenes is None:
         scenes = photograph_scenes(field_um(all_layouts), first.optics)
     if not scenes:
         raise ParameterError("scenes", "must be a mapping of names to at least one scene", scenes)
+    # All cameras have the same image, whose scale would otherwise follow from the layout of each.
+    lights = {
+        str(name): first.frame(light, others=named.values()) if isinstance(light, Scene) else light
+        for name, light in scenes.items()
+    }
     steps = count(1)
 
     def advance() -> None:
         if progress is not None:
-            progress(next(steps), len(named) * (len(scenes) + 1))
+            progress(next(steps), len(named) * (len(lights) + 1))
 
-    annuli, grid, covariance_grid = _field(all_layouts, fixation, n_annuli, max_pixels)
+    annuli, grid, covariance_grid = _field(list(named.values()), fixation, n_annuli, max_pixels)
     shots: dict[str, list[_Shot]] = {name: [] for name in named}
-    irradiance = []
-    known_response: dict[str, Floats] = {}
-    for light in scenes.values():
-        power_map = first.power_map(light) if isinstance(light, Scene) else light
-        # Means over the colour filters of the first camera.
-        seen = _behind_image(first)
-        irradiance.append(seen.reference(power_map, covariance_grid, exposure_s=exposure_s).data.mean(axis=0))
+    photons, bands = [], []
+    for light in lights.values():
+        maps: dict[tuple[float, float], PowerMap] = {}  # by the direction of cameras that turn
+        photons.append(_photons_per_um2(_image(first.at((0.0, 0.0)), light, maps), covariance_grid, exposure_s))
+        bands.append(_band_irradiance(maps[0.0, 0.0], covariance_grid))
         for name, camera in named.items():
             capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
             known = _with_angular_response(camera, light)
             picture = capture.picture(method, of="light_e", per="um2", grid=grid, sensor=known)
-            seen = _behind_image(camera)
-            ideal = seen.reference(power_map, grid, exposure_s=exposure_s)
-            shots[name].append(_Shot(picture, ideal, *scene_measures(seen, capture, power_map, annuli)))
-            known_response[name] = known.light_response()
+            ideal = camera.reference(light, grid, exposure_s=exposure_s)
+            model, measures = scene_measures(_behind_image(camera), capture, _image(camera, light, maps), annuli)
+            shots[name].append(_Shot(picture, ideal, model, known.light_response(), measures))
             advance()
     covered = [one[0].picture.coverage >= MIN_COVERAGE for one in shots.values()]
     is_common, is_field = (combine(covered, axis=0) for combine in (np.all, np.any))
     if not is_common.any():
         raise ParameterError("cameras", "must have a common part of the field; the layouts do not overlap")
-    covariance = scene_covariance(np.array(irradiance), covariance_grid.pitch_x_um)
-    mean_e_per_um2 = _mean_e_per_um2(shots[first_name])
-    density_per_um2 = budgets[first_name].n_sites / budgets[first_name].area_um2
-    wave_per_mm = WAVE_NYQUISTS * float(per_mm_from_per_um(0.5 * np.sqrt(density_per_um2)))
+    covariance = scene_covariance(np.array(photons), covariance_grid.pitch_x_um)
+    n_sites, area_um2 = (sum(getattr(one, part) for one in budgets.values()) for part in ("n_sites", "area_um2"))
+    wave_per_mm = WAVE_NYQUISTS * float(per_mm_from_per_um(0.5 * np.sqrt(n_sites / area_um2)))
     values: dict[str, list[Any]] = {key: [] for name in MEASURES for key in (name, name + BY_ECCENTRICITY)}
     pictures: dict[str, list[Picture]] = {}
-    first_light = next(iter(scenes.values()))
-    distance_m = float(first_light.distance_m) if isinstance(first_light, Scene) else None
-    wavelength_nm = float(np.mean(first_light.wavelength_nm))
+    ideals: dict[str, list[Picture]] = {}
+    waves = sorted(
+        {
+            (float(np.mean(light.wavelength_nm)), float(light.distance_m) if isinstance(light, Scene) else math.inf)
+            for light in lights.values()
+        }
+    )
     for name, camera in named.items():
         own = shots[name]
         qualities = [
             quality_by_eccentricity(one.picture, one.ideal, **annuli._asdict(), is_compared=is_common) for one in own
         ]
-        channel_e_per_um2 = np.nanmean([one.ideal.data for one in own], axis=(0, 2, 3))
-        response = channel_e_per_um2[camera.sensor.filter_of_site] / mean_e_per_um2 * known_response[name]
+        e_per_photon = _e_per_photon(camera.sensor, bands)
+        responses = [e_per_photon[camera.sensor.filter_of_site] * one.response for one in own]
         measures = [quality._asdict() | one.measures for quality, one in zip(qualities, own, strict=True)]
         found = (
             {key: [one[key] for one in measures] for key in measures[0]}
-            | information_by_annulus(camera, covariance, response, [one.model for one in own], annuli)
-            | layout_measures(camera, wavelength_nm, distance_m, annuli, wave_per_mm)
+            | information_by_annulus(camera, covariance, responses, [one.model for one in own], annuli)
+            | layout_measures(camera, waves, annuli, wave_per_mm)
         )
         for key, rows in values.items():
             rows.append(found[key])
-        scale = mean_e_per_um2 / _mean_e_per_um2(own)
+        # Pictures of sensors of other sensitivity have the same white.
+        scale = 1.0 / e_per_photon.mean()
         pictures[name] = [
-            replace(one.picture, data=(scale * quality.gain * one.picture.data).astype(np.float32))
-            for quality, one in zip(qualities, own, strict=True)
+            _scaled(one.picture, scale * quality.gain) for quality, one in zip(qualities, own, strict=True)
         ]
+        ideals[name] = [_scaled(one.ideal, scale) for one in own]
         advance()
     n_field = np.count_nonzero(is_field)
     return Comparison(
         names=tuple(named),
-        scenes=tuple(map(str, scenes)),
+        scenes=tuple(lights),
         budgets=tuple(budgets.values()),
         edges_um=read_only(annuli.edges_um),
         centre_um=fixation,
@@ -429,7 +441,7 @@ def cameras(
         coverage_fraction=read_only(np.array([np.count_nonzero(part) for part in covered]) / n_field),
         compared_fraction=float(np.count_nonzero(is_common) / n_field),
         pictures=pictures,
-        ideal=[one.ideal for one in shots[first_name]],
+        ideals=ideals,
         sizes={name: size_records(camera) for name, camera in named.items()},
         settings={
             "budget": budget,
@@ -461,39 +473,74 @@ def _with_angular_response(camera: Camera, light: Scene | PowerMap) -> Sensor:
     return camera.sensor.with_angular_response(camera.angular_response(light))
 
 
+def _image(camera: Camera, light: Scene | PowerMap, maps: dict[tuple[float, float], PowerMap]) -> PowerMap:
+    """Return the ideal image that a camera sees, from ``maps`` if it contains that of its direction."""
+    turned_um = camera.gaze_um if camera.axis == "sensor" else (0.0, 0.0)
+    if turned_um not in maps:
+        maps[turned_um] = camera.power_map(light) if isinstance(light, Scene) else light
+    return maps[turned_um]
+
+
+def _photons_per_um2(image: PowerMap, grid: Grid, exposure_s: float) -> Floats:
+    """Return the mean number of photons per area of each pixel of a grid, (n_y, n_x)."""
+    per_w_m2 = float(w_from_w_m2_um2(exposure_s)) / photon_energy_j(image.wavelength_nm)
+    return np.asarray(reference(image, grid, weights=per_w_m2[np.newaxis]).data[0], np.float64)
+
+
+def _band_irradiance(image: PowerMap, grid: Grid) -> tuple[Floats, Floats]:
+    """Return the wavelengths of an image, and the mean irradiance of each band in a field, or in all of it without a part."""
+    x0_um, y0_um, x1_um, y1_um = grid.bounds_um
+    is_x, is_y = (
+        (low <= at) & (at <= high)
+        for low, at, high in ((x0_um, image.grid.x_um, x1_um), (y0_um, image.grid.y_um, y1_um))
+    )
+    cells = image.data[:, is_y][:, :, is_x] if is_x.any() and is_y.any() else image.data
+    return image.wavelength_nm, cells.mean(axis=(1, 2), dtype=np.float64)
+
+
+def _e_per_photon(sensor: Sensor, bands: Sequence[tuple[Floats, Floats]]) -> Floats:
+    """Return the electrons of each filter per photon of the mean spectrum of several images."""
+    electrons = sum(sensor.responsivity_e_per_j(wavelength_nm) @ power for wavelength_nm, power in bands)
+    n_photons = sum(float((power / photon_energy_j(wavelength_nm)).sum()) for wavelength_nm, power in bands)
+    return np.asarray(electrons / n_photons, np.float64)
+
+
+def _scaled(picture: Picture, factor: float) -> Picture:
+    return replace(picture, data=(factor * picture.data).astype(np.float32))
+
+
 def _behind_image(camera: Camera) -> Camera:
     """Return a camera for its own power maps, which already have its gaze if it turns."""
     return camera if camera.axis == "image" else camera.at((0.0, 0.0))
 
 
 class _Shot(NamedTuple):
-    """Picture, ideal picture, model and measures of the capture of a scene by a camera."""
+    """Picture, ideal picture, model, response to light and measures of the capture of a scene by a camera."""
 
     picture: Picture
     ideal: Picture
     model: Linearisation
+    response: Floats
     measures: dict[str, Any]
 
 
 def _field(
-    all_layouts: Sequence[Layout], centre_um: tuple[float, float], n_annuli: int, max_pixels: int
+    cameras: Sequence[Camera], centre_um: tuple[float, float], n_annuli: int, max_pixels: int
 ) -> tuple[Annuli, Grid, Grid]:
-    """Return the annuli of the common field, and its grids for pictures and covariances."""
+    """Return the annuli and the picture grid of the common field, and the grid in the image for covariances."""
+    all_layouts = [camera.layout for camera in cameras]
     bounds_um = np.array([layout.bounds_um for layout in all_layouts])
     low, high = bounds_um[:, :2].min(axis=0), bounds_um[:, 2:].max(axis=0)
+    seen_um = bounds_um + np.tile([camera.gaze_um for camera in cameras], 2)
+    low_seen, high_seen = seen_um[:, :2].min(axis=0), seen_um[:, 2:].max(axis=0)
     site_um = min(math.sqrt(float(layout.area_um2.min())) for layout in all_layouts)
-    n_pixels = math.ceil(SITE_PIXELS * float((high - low).max()) / site_um)
+    n_pixels = math.ceil(SITE_PIXELS * float((high_seen - low_seen).max()) / site_um)
     reach_um = max(float(np.hypot(*(layout.centroid_um - centre_um).T).max()) for layout in all_layouts)
     return (
         Annuli(centre_um, np.linspace(0.0, reach_um * (1.0 + EDGE_ROUNDING), n_annuli + 1)),
         _grid(low, high, max_pixels),
-        _grid(low, high, min(max(n_pixels, MIN_FIELD_PIXELS), MAX_FIELD_PIXELS)),
+        _grid(low_seen, high_seen, min(max(n_pixels, MIN_FIELD_PIXELS), MAX_FIELD_PIXELS)),
     )
-
-
-def _mean_e_per_um2(shots: Sequence[_Shot]) -> float:
-    """Return the mean of the ideal pictures."""
-    return float(np.mean([np.nanmean(one.ideal.data) for one in shots]))
 
 
 def layouts(

@@ -77,7 +77,9 @@ MEASURES = {
         "PSNR", "dB", "peak signal-to-noise ratio of the picture, with the range of the ideal picture as peak", True
     ),
     "ssim": Measure("SSIM", "", "structural similarity of the picture and the ideal picture", True),
-    "snr_db": Measure("SNR per site", "dB", "signal-to-noise ratio of a site, mean over the sites, 20 log₁₀", True),
+    "snr_db": Measure(
+        "SNR per site", "dB", "signal-to-noise ratio of a site, 0 if it is saturated, mean over the sites, 20 log₁₀", True
+    ),
     "information_bit_per_site": Measure(
         "information per site", "bit", "Gaussian estimate of the information about the scenes, per site", True
     ),
@@ -96,7 +98,7 @@ MEASURES = {
         "alias contrast",
         "",
         "largest contrast of an alias of a sine wave along x, at 1.5 times the Nyquist frequency of a square grid with as many "
-        "sites per area as the first camera",
+        "sites per area as the cameras on average",
         False,
         is_better_low=True,
     ),
@@ -104,9 +106,13 @@ MEASURES = {
 
 
 def layout_measures(
-    camera: Camera, wavelength_nm: float, distance_m: float | None, annuli: Annuli, wave_per_mm: float
+    camera: Camera, waves: Sequence[tuple[float, float]], annuli: Annuli, wave_per_mm: float
 ) -> dict[str, Any]:
-    """Return the measures that do not depend on a scene, in total and by annulus."""
+    """
+    Return the measures that do not depend on a scene, in total and by annulus.
+
+    ``waves``: wavelengths in nm and distances in m of the scenes. The MTF of the lens is their mean.
+    """
     layout = camera.layout
     annulus = annuli.index_of(layout.centroid_um)
     (x_um, y_um), edges_um = annuli
@@ -114,7 +120,13 @@ def layout_measures(
     frequency = np.linspace(
         0.0, MAX_FREQUENCY * float(per_mm_from_per_um(1.0 / np.sqrt(layout.area_um2.min()))), MTF_FREQUENCIES
     )
-    lens = camera.optics.mtf(frequency, wavelength_nm, distance_m=distance_m)
+
+    def lens_mtf(per_mm: Floats) -> Floats:
+        return np.asarray(
+            np.mean([camera.optics.mtf(per_mm, wave_nm, distance_m=at_m) for wave_nm, at_m in waves], axis=0)
+        )
+
+    lens = lens_mtf(frequency)
 
     def mtf50(sites: Ints) -> float:
         if not sites.size:
@@ -130,7 +142,7 @@ def layout_measures(
             found = aliasing_spectrum(layout, (wave_per_mm, 0.0), centre_um=middle_um, radius_um=radius_um)
         except ParameterError:
             return float("nan")  # too few sites
-        return found.alias_fraction * float(camera.optics.mtf(wave_per_mm, wavelength_nm, distance_m=distance_m))
+        return found.alias_fraction * float(lens_mtf(np.array([wave_per_mm]))[0])
 
     order = np.argsort(layout.area_um2, kind="stable")
     by_annulus = [order[annulus[order] == k] for k in range(edges_um.size - 1)]
@@ -166,7 +178,7 @@ def scene_measures(
     exposure_s = float(capture.settings["exposure_s"])
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
     model = sensor.linearise(capture.expected_e, exposure_s=exposure_s)
-    ratio = site_signals(model, dark_e).ratio
+    ratio = site_signals(model, dark_e).unsaturated_ratio
     annulus = annuli.index_of(layout.centroid_um)
     gradient = _shift_gradients_e_per_um(camera, image, exposure_s)
     parts = flow_bound(gradient, model, regions=annulus)
@@ -212,17 +224,17 @@ def _shift_gradients_e_per_um(camera: Camera, image: PowerMap, exposure_s: float
 def information_by_annulus(
     camera: Camera,
     covariance: SceneCovariance,
-    response: NDArray[np.float64],
+    responses: Sequence[NDArray[np.float64]],
     models: Sequence[Linearisation],
     annuli: Annuli,
 ) -> dict[str, Any]:
     """
     Return the information per site and per mm², (n_scene,) and (n_scene, n_annulus).
 
-    ``response`` is the ratio of each site's expected charge per area to the irradiance of the covariance.
+    ``responses``: for each scene, the ratio of each site's expected charge per area to the irradiance of the covariance.
     """
     layout = camera.layout
-    gain = [layout.area_um2 * model.forward(response) for model in models]
+    gain = [layout.area_um2 * model.forward(response) for model, response in zip(models, responses, strict=True)]
     bits = site_information_bits(layout, covariance, gain, models)
     annulus, area_mm2 = annuli.index_of(layout.centroid_um), layout.area_um2 / UM2_PER_MM2
     return {

@@ -106,12 +106,19 @@ def _summary(comparison: Comparison) -> ReportSection:
 def _pictures(comparison: Comparison) -> list[list[ReportFigure]]:
     rows = []
     for k, scene in enumerate(comparison.scenes[:MAX_SHOWN_SCENES]):
-        ideal = comparison.ideal[k]
-        balance = np.ones(len(ideal.data)) if ideal.white is None else ideal.white
-        white = balance * np.nanquantile(ideal.data / balance.reshape(-1, 1, 1), WHITE_QUANTILE)
-        row = [picture_figure(_pixels(ideal, white), "ideal", f"{scene}: irradiance on the picture grid.")]
-        for i, name in enumerate(comparison.names):
+        ideals = {name: comparison.ideals[name][k] for name in comparison.names}
+        one = next(iter(ideals.values()))
+        balance = np.ones(len(one.data)) if one.white is None else one.white
+        white = balance * max(
+            float(np.nanquantile(ideal.data / balance.reshape(-1, 1, 1), WHITE_QUANTILE)) for ideal in ideals.values()
+        )
+        are_equal = all(np.array_equal(ideal.data, one.data, equal_nan=True) for ideal in ideals.values())
+        row = []
+        for i, (name, ideal) in enumerate(ideals.items()):
             psnr = comparison.values["psnr_db"][i, k]
+            if i == 0 or not are_equal:
+                title = "ideal" if are_equal else f"ideal image of {name}"
+                row.append(picture_figure(_pixels(ideal, white), title, f"{scene}: irradiance on the picture grid."))
             row.append(
                 picture_figure(_pixels(comparison.pictures[name][k], white), name, f"{scene}: PSNR {psnr:.1f} dB.")
             )

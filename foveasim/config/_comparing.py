@@ -137,17 +137,27 @@ def _scenes(shots: dict[str, Shot], paths: Sequence[Path]) -> dict[str, Scene | 
 
 
 def _photographs(shots: dict[str, Shot], pictures: Sequence[str | Path]) -> dict[str, Scene]:
-    """Return photographs with the distance, radiance and bands of the first scene."""
-    name, shot = next(iter(shots.items()))
-    if isinstance(shot.scene, PowerMap):
-        raise FileError(name, "has a power map as scene; photographs require a scene with a radiance")
-    scene = shot.scene
-    return compare.photograph_scenes(
-        field_um([one.camera.sensor.layout for one in shots.values()]),  # type: ignore[misc]
-        shot.camera.optics,
-        pictures=pictures,
-        distance_m=scene.distance_m,
-        peak_radiance_w_m2_sr_nm=float(scene.spectrum_w_m2_sr_nm.max()),
-        wavelength_nm=scene.wavelength_nm.tolist(),
-        band_width_nm=scene.band_width_nm.tolist(),
-    )
+    """Return photographs with the distance, radiance and bands of the scenes of all shots, which must be equal."""
+    light: dict[str, dict[str, Any]] = {}
+    for name, shot in shots.items():
+        scene = shot.scene
+        if isinstance(scene, PowerMap):
+            raise FileError(name, "has a power map as scene; photographs require a scene with a radiance")
+        light[name] = {
+            "distance_m": scene.distance_m,
+            "peak_radiance_w_m2_sr_nm": float(scene.spectrum_w_m2_sr_nm.max()),
+            "wavelength_nm": scene.wavelength_nm.tolist(),
+            "band_width_nm": scene.band_width_nm.tolist(),
+        }
+    (first, common), *others = light.items()
+    for name, own in others:
+        different = [key for key in common if own[key] != common[key]]
+        if different:
+            raise ParameterError(
+                "pictures",
+                f"require shots whose scenes have the same {different[0]}: those of {printable(first)} and {printable(name)} "
+                "differ",
+            )
+    cameras = [shot.camera for shot in shots.values()]
+    width_um = field_um([camera.layout for camera in cameras])
+    return compare.photograph_scenes(width_um, cameras[0].optics, pictures=pictures, **common)

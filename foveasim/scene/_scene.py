@@ -174,6 +174,9 @@ class Scene:
     illuminant: Floats | None = field(default=None, kw_only=True)
     is_rgb: bool = field(default=False, kw_only=True)
 
+    #: Where the optical axis of a framed scene meets the sensor, (x, y) µm: :meth:`framed`.
+    axis_um: ClassVar[tuple[float, float] | None] = None
+
     def __post_init__(self) -> None:
         check_declared(self)
         basis = np.asarray(unmasked("basis", self.basis))
@@ -272,12 +275,16 @@ class Scene:
             Shares the arrays of this scene.
         """
         return self._with(
-            pitch_um=PITCH.check("pitch_um", pitch_um), fit=None, gaze_range_um=(0.0, 0.0), field_of_view_deg=None
+            pitch_um=PITCH.check("pitch_um", pitch_um),
+            fit=None,
+            gaze_range_um=(0.0, 0.0),
+            field_of_view_deg=None,
+            axis_um=None,
         )
 
-    def framed(self, pitch_um: float) -> Scene:
-        """Return a scene with ``fit`` with the pitch that it requires; ``fit`` remains."""
-        return self._with(pitch_um=PITCH.check("pitch_um", pitch_um))
+    def framed(self, pitch_um: float, axis_um: tuple[float, float] | None) -> Scene:
+        """Return a scene with ``fit`` with the pitch and the optical axis that it requires; ``fit`` remains."""
+        return self._with(pitch_um=PITCH.check("pitch_um", pitch_um), axis_um=axis_um)
 
     def with_centre(self, centre_um: tuple[float, float]) -> Scene:
         """

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from foveasim._core.validation import Floats
+from foveasim.capture import Capture
 from foveasim.compare import budget_of, quality_by_eccentricity
-from foveasim.errors import FoveasimError
-from foveasim.fields import Grid
+from foveasim.errors import FoveasimError, ParameterError
+from foveasim.fields import Grid, PowerMap
 from foveasim.layout import Layout
+from foveasim.scene import Scene
 from foveasim.studio._engine import Simulated
 from foveasim.studio._settings.unknowns import is_generated
 
@@ -42,8 +44,9 @@ def compare(variants: Sequence[tuple[str, Simulated]]) -> dict[str, Any]:
     """
     Return budgets and picture quality of variants with their names.
 
-    The data rate is that of the first variant: with its readout, or one frame per exposure. Pictures are compared with the
-    optical image in squares of equal size around the fovea of each variant.
+    The data rate is the highest of the variants: with its readout, or one frame per exposure. Scenes with ``fit`` are framed on
+    all layouts together where the lenses are equal. Pictures are compared with the optical image in squares of equal size
+    around the fovea of each variant.
 
     Returns
     -------
@@ -51,13 +54,18 @@ def compare(variants: Sequence[tuple[str, Simulated]]) -> dict[str, Any]:
         Names; rows with the name, label, unit and the values of all variants; sides of the squares, µm; whether the last
         variant can have another number of photosites.
     """
-    first, last = variants[0][1], variants[-1][1]
+    last = variants[-1][1]
     half_um = min(_half_side_um(result.capture.layout) for _, result in variants)
-    readout = None if first.shot.rules is None else first.shot.rules.readout
-    exposure_s = first.shot.exposure_s
-    frames_per_s = readout.frames_per_s if readout is not None else 1.0 / exposure_s if exposure_s > 0 else None
-    rate_bit_per_s = frames_per_s and budget_of(first.shot.camera, frames_per_s).data_rate_bit_per_s
-    found = [_measures(result, rate_bit_per_s, half_um) for _, result in variants]
+    rates_bit_per_s = [
+        budget_of(result.shot.camera, rate).data_rate_bit_per_s
+        for _, result in variants
+        if (rate := _frame_rate(result))
+    ]
+    rate_bit_per_s = max(rates_bit_per_s, default=None)
+    framed = _framed_together([result for _, result in variants])
+    found = [
+        _measures(*one, rate_bit_per_s, half_um) for one in zip((result for _, result in variants), framed, strict=True)
+    ]
     rows = [
         {"name": name, "label": label, "unit": unit, "values": [each[name] for each in found]}
         for name, (label, unit) in ROWS.items()
@@ -71,7 +79,40 @@ def compare(variants: Sequence[tuple[str, Simulated]]) -> dict[str, Any]:
     }
 
 
-def _measures(result: Simulated, rate_bit_per_s: float | None, half_um: float) -> dict[str, float | None]:
+def _frame_rate(result: Simulated) -> float | None:
+    """Return the frame rate of a variant's readout, or of its exposures; None without both."""
+    readout = None if result.shot.rules is None else result.shot.rules.readout
+    if readout is not None and readout.frames_per_s is not None:
+        return float(readout.frames_per_s)
+    return 1.0 / result.shot.exposure_s if result.shot.exposure_s > 0.0 else None
+
+
+def _framed_together(results: Sequence[Simulated]) -> list[tuple[Scene | PowerMap, Capture]]:
+    """Return the scene and the capture of each variant, with scenes with ``fit`` framed on all layouts."""
+    shots = [result.shot for result in results]
+    cameras = [shot.camera for shot in shots]
+    own = [(shot.scene, result.capture) for shot, result in zip(shots, results, strict=True)]
+    fits = {shot.scene.fit if isinstance(shot.scene, Scene) and shot.scene.pitch_um is None else None for shot in shots}
+    if len(fits) > 1 or fits == {None}:
+        return own
+    found: list[tuple[Scene | PowerMap, Capture]] = []
+    for shot, result in zip(shots, results, strict=True):
+        assert isinstance(shot.scene, Scene)
+        try:
+            framed, alone = shot.camera.frame(shot.scene, others=cameras), shot.camera.frame(shot.scene)
+        except ParameterError:  # other lenses
+            return own
+        is_same = (framed.pitch_um, framed.axis_um) == (alone.pitch_um, alone.axis_um)
+        if is_same:
+            found.append((framed, result.capture))
+        else:
+            found.append((framed, shot.camera.capture(framed, exposure_s=shot.exposure_s, seed=shot.seed)))
+    return found
+
+
+def _measures(
+    result: Simulated, framed: tuple[Scene | PowerMap, Capture], rate_bit_per_s: float | None, half_um: float
+) -> dict[str, float | None]:
     budget = budget_of(result.shot.camera, 1.0)
     found: dict[str, float | None] = {
         "n_sites": budget.n_sites,
@@ -82,11 +123,11 @@ def _measures(result: Simulated, rate_bit_per_s: float | None, half_um: float) -
         "total_e": float(result.capture.electrons.sum(dtype=np.float64)),
         "read_noise_e": float(np.sqrt(budget.read_noise_e2)),
     }
-    camera, scene, centre_um = result.shot.camera, result.shot.scene, fovea_um(result.capture.layout)
+    (scene, capture), camera, centre_um = framed, result.shot.camera, fovea_um(result.capture.layout)
     for name, side_um in (("field", half_um), ("fovea", FOVEA_FRACTION * half_um)):
         grid = _square(centre_um, side_um)
         try:
-            picture = result.capture.picture(of="light_e", per="um2", grid=grid, sensor=camera.sensor)
+            picture = capture.picture(of="light_e", per="um2", grid=grid, sensor=camera.sensor)
             reference = camera.reference(scene, grid, exposure_s=result.shot.exposure_s)
             quality = quality_by_eccentricity(picture, reference, edges_um=np.array([0.0, side_um]))
             found |= {f"{name}_psnr_db": quality.psnr_db, f"{name}_ssim": quality.ssim}

@@ -9,7 +9,7 @@ from PIL import Image
 import foveasim as fs
 
 SHOT = """
-scene: {{kind: picture, picture: photo.png, pitch_um: 200.0, distance_m: 1.0, peak_radiance_w_m2_sr_nm: 0.02,
+scene: {{kind: picture, picture: photo.png, pitch_um: 200.0, distance_m: {distance_m}, peak_radiance_w_m2_sr_nm: 0.02,
   wavelength_nm: 550, band_width_nm: 100}}
 optics: {{focal_length_mm: 8.0, f_number: {f_number}}}
 layout: {{generator: grid, parameters: {{n_sites: {n_sites}, size_um: [100.0, 100.0]}}}}
@@ -31,9 +31,10 @@ def folder(tmp_path_factory):
         "fine": {"n_sites": 900},
         "other_lens": {"f_number": 2.0},
         "long": {"exposure_s": 0.02},
+        "far": {"distance_m": 2.0},
     }.items():
         (folder / f"{name}.yaml").write_text(
-            SHOT.format(**{"f_number": 4.0, "n_sites": 400, "exposure_s": 0.01, **options})
+            SHOT.format(**{"f_number": 4.0, "n_sites": 400, "exposure_s": 0.01, "distance_m": 1.0, **options})
         )
     return folder
 
@@ -87,6 +88,10 @@ def test_shots_are_compared_on_their_scenes(foveasim, folder):
         (("shot.yaml", "shot.yaml", "--budget", "bits"), "'budget' must be one of 'n_sites', 'data_rate'"),
         (("shot.yaml", "shot.yaml", "-o", "report.pdf"), "report.pdf: must end in .html"),
         (("shot.yaml", "shot.yaml", "--picture", "gone.png"), "gone.png: no such file"),
+        (
+            ("shot.yaml", "far.yaml", "--picture", "photo.png"),
+            "'pictures' require shots whose scenes have the same distance_m: those of shot and far differ",
+        ),
     ],
 )
 def test_bad_comparisons_have_one_line(foveasim, folder, arguments, message):

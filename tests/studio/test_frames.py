@@ -257,8 +257,8 @@ def test_comparison_has_closed_form_budgets(recorder):
 
     assert found["n_sites"] == [224, 448]
     assert found["bits_per_frame"] == [2240, 3584]
-    # One frame per exposure of 10 ms; B has the same data rate of 224,000 bit/s.
-    assert found["frames_per_s"] == pytest.approx([100.0, 62.5])
+    # B has one frame per exposure of 10 ms, 358,400 bit/s, and A as many bits per second.
+    assert found["frames_per_s"] == pytest.approx([160.0, 100.0])
     assert found["area_mm2"] == pytest.approx([224 * 144e-6, 448 * 144e-6])
     assert found["readout_steps"] == [14, 14]
     assert found["read_noise_e"] == pytest.approx([2.0 * 224**0.5, 2.0 * 448**0.5])
@@ -318,6 +318,30 @@ def test_finer_sites_have_better_pictures(settings):
     for name in ("fovea_psnr_db", "field_psnr_db", "field_ssim"):
         assert found[name][1] > found[name][0]
     assert fovea_um(fine.capture.layout) == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+@pytest.mark.parametrize("fit", ["cover", "contain"])
+def test_comparison_is_independent_of_variant_order(settings, fit):
+    engine = Engine(n_threads=1)
+    settings["scene"] = {
+        "kind": "picture",
+        "picture": "skimage:astronaut",
+        "fit": fit,
+        "distance_m": 1.0,
+        "illuminance_lux": 2000.0,
+    }
+    wide = engine.simulate(settings)
+    settings["layout"]["parameters"] = {"n_x": 30, "n_y": 60, "pitch_um": 4.0}
+    high = engine.simulate(settings)
+
+    (first, second) = (
+        {row["name"]: row["values"] for row in compare(order)["rows"]}
+        for order in ([("wide", wide), ("high", high)], [("high", high), ("wide", wide)])
+    )
+
+    assert all(values[::-1] == second[name] for name, values in first.items())
+    # Both see the same image: the field of the union is larger than that of each.
+    assert wide.shot.camera.frame(wide.shot.scene).pitch_um != high.shot.camera.frame(high.shot.scene).pitch_um
 
 
 # -- notebook, archive, links -----------------------------------------------------------------------------------------------------

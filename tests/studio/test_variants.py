@@ -138,8 +138,8 @@ def test_three_variants_are_compared(make_session):
 
     assert names == ["A", "squares", "hexagons", "B"]
     assert found["n_sites"] == [112, 224, 224, 112]
-    # At the data rate of A: 112 sites of 10 bits in 10 ms.
-    assert found["frames_per_s"] == pytest.approx([100.0, 50.0, 50.0, 100.0])
+    # At the highest data rate: 224 sites of 10 bits in 10 ms.
+    assert found["frames_per_s"] == pytest.approx([200.0, 100.0, 100.0, 200.0])
     assert found["area_mm2"][1] == pytest.approx(224 * 144e-6)
     assert [each["is_compared"] for each in state["variants"]] == [True, True]
 

@@ -6,7 +6,7 @@ import { make } from "/web/page_parts.js";
 // Largest relative difference of equal numbers of photosites: generators solve for a number within this tolerance.
 const MATCHED = 0.01;
 // Notes on rows, by name.
-const NOTES = { total_e: "Signal of all photosites in a frame",
+const NOTES = { frames_per_s: "At the highest data rate of the variants", total_e: "Signal of all photosites in a frame",
   read_noise_e: "Root sum of squares over all photosites",
   readout_steps: "Photosites on the longest readout line; lines are read in parallel", area_mm2: "Total area of the photosites" };
 // Four digits; "∞" for an infinite value, "–" without value.
@@ -29,7 +29,7 @@ function show({ table, note, button }, about, hasMatch) {
     const row = make("tr"), title = make("th", label);
     title.scope = "row";
     row.dataset.name = name;
-    title.title = name === "frames_per_s" ? "At the data rate of " + about.names[0] : NOTES[name] || "";
+    title.title = NOTES[name] || "";
     if (/^(fovea|field)_/.test(name)) title.title = "Against the optical image, after a fit of one gain, on a square of "
       + sizes[name.startsWith("fovea") ? 0 : 1] + " µm";
     row.append(title, ...values.map((value) => make("td", name === "n_sites" ? shown(value) : figure(value, unit))));

@@ -1,0 +1,84 @@
+"""Framing: the pitch and the optical axis of a scene with ``fit`` on the layouts of one or several cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from foveasim._core.provenance import to_plain_data
+from foveasim._core.validation import Floats
+from foveasim.camera._frames import Position
+from foveasim.camera._steps import SensorFrame
+from foveasim.camera._warnings import format_point, size_um
+from foveasim.distortion import Lens
+from foveasim.errors import ParameterError
+from foveasim.optics import Optics
+from foveasim.scene import Scene
+
+if TYPE_CHECKING:
+    from foveasim.camera._camera import Camera
+
+#: Distance of the centre of a layout from its origin, relative to its size, that counts as rounding.
+CENTRE_ROUNDING = 1e-9
+#: Margin of a picture that covers undistorted outlines: their edges are curves of limited accuracy.
+COVER_MARGIN = 1e-5
+
+
+def axis_of(bounds_um: Floats) -> Position:
+    """Return the optical axis of a framed scene without a lens model: the centre of the bounding box (4,) µm."""
+    centre_um = 0.5 * (bounds_um[:2] + bounds_um[2:])
+    is_centred = np.abs(centre_um) <= CENTRE_ROUNDING * (bounds_um[2:] - bounds_um[:2])
+    x_um, y_um = np.where(is_centred, 0.0, centre_um).tolist()
+    return x_um, y_um
+
+
+def common_bounds_um(cameras: Sequence[Camera], fit: str) -> Floats:
+    """
+    Return the bounds of the undistorted outlines of all cameras, (4,) µm.
+
+    Raises ParameterError when lenses differ, or when no camera has photosites in the image circle.
+    """
+    first, *others = cameras
+    for part in ("optics", "distortion") if others else ():
+        own = to_plain_data(getattr(first, part))
+        if any(to_plain_data(getattr(camera, part)) != own for camera in others):
+            raise ParameterError("others", f"must be cameras with the same {part}")
+    bounds_um = np.array([camera.layout_bounds_um for camera in cameras])
+    known_um = bounds_um[~np.isnan(bounds_um).any(axis=1)]
+    if not known_um.size:
+        required = "photosites in the image circle" if any(c.layout.n_sites for c in cameras) else "photosites"
+        raise ParameterError("fit", f"must be used with a layout that has {required}", fit)
+    return np.concatenate((known_um[:, :2].min(axis=0), known_um[:, 2:].max(axis=0)))
+
+
+def fit_scene(scene: Scene, optics: Optics, lens: Lens | None, bounds_um: Floats) -> Scene:
+    """
+    Return a scene with the pitch and the optical axis of its framing on a field, with bounds (4,) µm.
+
+    See :meth:`foveasim.Camera.frame`.
+    """
+    fit, frame = scene.fit, SensorFrame.of(lens, axis_of(bounds_um))
+    axis_um, range_um = np.array(frame.axis_um), np.array(scene.gaze_range_um)
+    below_um, above_um = axis_um - bounds_um[:2] + range_um, bounds_um[2:] - axis_um + range_um
+    # The image scales with the pitch. At this one its pixels are of about 1 µm.
+    unit_um = 1.0 / optics.magnification(scene.distance_m)
+    one = scene.framed(unit_um, frame.axis_um)
+    images = [optics.grid(one)] if fit == "width" else [grid for grid, _ in optics.image_grids(one)]
+    half_um = 0.5 * np.array([size_um(frame.image(grid).bounds_um) for grid in images])
+    if fit == "width":
+        scale = 0.5 * (below_um + above_um)[0] / half_um[0, 0]
+    elif fit == "cover":
+        margin = 0.0 if lens is None else COVER_MARGIN
+        scale = (1.0 + margin) * (np.maximum(below_um, above_um) / half_um.min(axis=0)).max()
+    else:
+        scale = (np.minimum(below_um, above_um) / half_um.max(axis=0)).min()
+        if not scale > 0.0:
+            raise ParameterError(
+                "fit",
+                f"must not be 'contain' with the optical axis, at {format_point(axis_um)} µm, outside the layout, which "
+                f"extends from {format_point(bounds_um[:2])} to {format_point(bounds_um[2:])} µm; use 'cover' or "
+                "'width', or move the layout",
+            )
+    return scene.framed(float(scale) * unit_um, frame.axis_um)
