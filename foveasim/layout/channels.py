@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import NOT_NEGATIVE, Limits
+from foveasim._core.channel_letters import CHANNEL_LETTERS, COLOURS
 from foveasim._core.names import did_you_mean, list_names
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Ints, finite_array, freeze
@@ -61,13 +62,15 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     names : str, optional
         Letters in the order of the sensor's filters: the ``channel`` of a site is the index of its letter. "RGB" by
         default, "RGBW" for a block of these letters with a W; otherwise the letters of the block, R, G, B and W first, then
-        alphabetically, or all alphabetically if they are the first ones of the alphabet.
+        alphabetically, or all alphabetically if they are the first ones of the alphabet, for numbered bands. Without
+        ``names``, other letters are those of colours (R, G, B, W or C for clear, Y, M, C, E, N or I), and a sensor checks that
+        its filters have their names in this order.
 
     Raises
     ------
     ParameterError
-        When the block is neither a name nor a rectangle of known letters, or the layout has no such columns and is not a
-        lattice.
+        When the block is neither a name nor a rectangle of letters of ``names`` or of colours, or the layout has no such
+        columns and is not a lattice.
 
     Examples
     --------
@@ -80,8 +83,16 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     rows = list(block) if isinstance(block, Sequence) else []
     if not rows or not all(isinstance(row, str) and row and len(row) == len(rows[0]) for row in rows):
         raise ParameterError("block", "must be rows of letters of equal length, such as ('RG', 'GB')", block)
+    is_default = names is None
     if names is None:
         names = _default_names(set("".join(rows)))
+        others = sorted(set(names) - set(COLOURS)) if names != ascii_uppercase[: len(names)] else []
+        if others:
+            raise ParameterError(
+                "block",
+                f"must use letters of colours, {', '.join(COLOURS)}, got {', '.join(map(repr, others))}",
+                hint=f"pass names={names!r}, with the letters in the order of the sensor's filters, for other filters",
+            )
     if len(set(names)) != len(names):
         raise ParameterError("names", "must not contain a letter twice", names)
     unknown = sorted(set("".join(rows)) - set(names))
@@ -94,7 +105,9 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     position *= n_columns
     position += column % n_columns
     columns = {**layout.columns, "channel": freeze(channels.ravel()[position])}
-    return derived(layout, f"mosaic {' '.join(rows)} of {names}", columns=columns)
+    found = derived(layout, f"mosaic {' '.join(rows)} of {names}", columns=columns)
+    kept = {key: value for key, value in found.provenance.items() if key != CHANNEL_LETTERS}
+    return found.with_provenance(kept | ({CHANNEL_LETTERS: names} if is_default else {}))
 
 
 def _named_block(name: str) -> Sequence[str]:

@@ -13,6 +13,7 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FINITE, POSITIVE, OwnCheck
+from foveasim._core.channel_letters import CHANNEL_LETTERS
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data
 from foveasim._core.rings import (
@@ -521,7 +522,10 @@ class Layout:
 
     def with_columns(self, **columns: OwnCheck[ArrayLike]) -> Layout:
         """Return the layout with columns added or replaced."""
-        return derived(self, f"columns {', '.join(columns)} set", columns={**self.columns, **columns})
+        found = derived(self, f"columns {', '.join(columns)} set", columns={**self.columns, **columns})
+        if "channel" in columns and CHANNEL_LETTERS in found.provenance:
+            return found.with_provenance({k: v for k, v in found.provenance.items() if k != CHANNEL_LETTERS})
+        return found
 
     def translate(self, dx_um: Annotated[float, FINITE], dy_um: Annotated[float, FINITE]) -> Layout:
         """Translate the layout by (dx, dy) in µm."""

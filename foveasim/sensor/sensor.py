@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Limits, OwnCheck, Usual, check_declared, declarations_of
+from foveasim._core.channel_letters import CHANNEL_LETTERS, find_wrong_letter
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import is_digest, large_arrays, resolve
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site, finite_array, read_only, unmasked
-from foveasim.errors import ParameterError, SimulationError, type_name
+from foveasim.errors import ParameterError, SimulationError, format_value, type_name
 from foveasim.incidence import ChiefRayTable
 from foveasim.sensor.adc import ADC, BITS, DNL, INL, LOG_STRENGTH, Companding, ConversionTables
 from foveasim.sensor.blocks import for_each_block
@@ -294,6 +295,16 @@ class Sensor:
             raise SimulationError(
                 f"the layout has sites of channel {highest}, but the sensor has only filters 0 to {self.n_filters - 1} "
                 f"({', '.join(self.filter_names)})"
+            )
+        letters = str(getattr(self.layout, "provenance", {}).get(CHANNEL_LETTERS, ""))
+        wrong = (
+            find_wrong_letter(letters, np.unique(self.filter_of_site).tolist(), self.filter_names) if letters else None
+        )
+        if wrong is not None:
+            raise SimulationError(
+                f"the layout has a mosaic of the letters {letters}, but filter {wrong} of the sensor is "
+                f"{format_value(self.filter_names[wrong])}, not of the colour {letters[wrong]!r}; order the filters "
+                f"({', '.join(self.filter_names)}) as the letters, or pass names= to foveasim.layout.mosaic"
             )
 
     @classmethod

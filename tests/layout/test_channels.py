@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 import foveasim as fs
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import MOSAICS, graph_colouring, mosaic, nearest_bus, random_channels, readout_by, readout_order
 
 GRID = fs.layout.grid(n_x=12, n_y=12, pitch_um=1.0)
@@ -115,6 +115,9 @@ def test_readout_by_column_uses_its_indices():
     ("call", "message"),
     [
         (lambda: mosaic(GRID, "bayer", names="RRGB"), "'names' must not contain a letter twice"),
+        (lambda: mosaic(GRID, "RGGX"), "'block' must use letters of colours, R, G, .* got 'X'; pass names='RGX'"),
+        (lambda: mosaic(GRID, "XXXX"), "'block' must use letters of colours, .* got 'X'"),
+        (lambda: mosaic(GRID, ("rg", "gb")), "got 'b', 'g', 'r'"),
         (lambda: random_channels(GRID, (0, 0), seed=0), "'fractions' must not all be 0"),
         (lambda: random_channels(GRID, (1, -1), seed=0), "'fractions' must be >= 0"),
         (lambda: graph_colouring(GRID, 0), "'n_channels' must be >= 1"),
@@ -129,3 +132,47 @@ def test_invalid_argument_raises_with_name(call, message):
 
 def test_named_blocks_are_rectangular():
     assert all(len({len(row) for row in block}) == 1 for block in MOSAICS.values())
+
+
+def filters_of(*names):
+    return fs.FilterSet([fs.sensor.ConstantCurve(0.5)] * len(names), names or None)
+
+
+@pytest.mark.parametrize(
+    ("block", "names", "filters"),
+    [
+        ("RGGB", None, ("red", "green", "blue")),
+        ("RGGB", None, ("R", "G1", "B")),
+        ("RRRR", None, ("red", "green", "blue")),
+        ("RCCB", None, ("red", "blue", "clear")),
+        ("rgbw", None, ("red", "green", "blue", "panchromatic")),
+        ("RGGB", "RGB", ("long", "medium", "short")),
+        ("RGGX", "RXG", ("red", "infrared", "green")),
+        ("ABCD", None, ("blue", "green", "red", "infrared")),
+    ],
+)
+def test_filters_with_names_of_letters_are_accepted(block, names, filters):
+    sensor = fs.Sensor(mosaic(GRID, block, names), filters=filters_of(*filters))
+
+    assert sensor.n_filters == len(filters)
+
+
+@pytest.mark.parametrize(
+    ("block", "filters", "message"),
+    [
+        ("RCCB", ("red", "clear", "blue"), "letters RBC, but filter 1 of the sensor is 'clear', not of the colour 'B'"),
+        ("RGGB", ("cyan", "magenta", "yellow"), "filter 0 of the sensor is 'cyan', not of the colour 'R'"),
+        ("ABBA", ("red", "green", "blue"), "filter 0 of the sensor is 'red', not of the colour 'A'"),
+    ],
+)
+def test_filters_of_other_colours_are_rejected(block, filters, message, tmp_path):
+    mosaic(GRID, block).write(tmp_path / "mosaic.npz")
+    for layout in (
+        mosaic(GRID, block),
+        mosaic(GRID, block)[:40].translate(1.0, 0.0),
+        fs.read_layout(tmp_path / "mosaic.npz"),
+    ):
+        with pytest.raises(SimulationError, match=message):
+            fs.Sensor(layout, filters=filters_of(*filters))
+        fs.Sensor(layout, filters=fs.FilterSet(filters_of(*filters).curves))  # without names, the order counts
+        fs.Sensor(layout.with_columns(channel=layout.channel), filters=filters_of(*filters))
