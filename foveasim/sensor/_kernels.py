@@ -737,7 +737,8 @@ def predict_codes(charges, tables, transfer, line, adc, mean_dn, variance_dn2):
             low, high = min(first, end) - reach, first + n - 1.0 + reach
         elif is_poisson:
             variance = mean
-            low = max(mean - _range_below(mean + sigma * sigma) - half_step, -reach)
+            # A charge above the full well is the full well, with the noise around it.
+            low = max(min(mean - _range_below(mean + sigma * sigma) - half_step, well - reach), -reach)
             high = mean + _range_above(mean + sigma * sigma) + half_step
         else:
             if is_discrete or variance == 0.0:

@@ -211,6 +211,50 @@ def test_prediction_near_full_well_equals_sums(sigma_e):
     assert_equals_sums(sensor, [850.0, 950.0, 999.0, 1000.5, 1040.0, 1200.0, 5000.0], sigma_e)
 
 
+def clipped_moments_by_sums(sensor, mean_e, sigma_e):
+    """Return code mean and variance of a charge clipped at an integer full well, as :func:`moments_by_sums`, but quickly."""
+    charge, probability = charge_probabilities(mean_e)
+    well_e = int(sensor.well_e[0])
+    is_full = charge >= well_e
+    charge = np.append(charge[~is_full], well_e)
+    probability = np.append(probability[~is_full], probability[is_full].sum())
+    transitions_e = sensor.adc.transition_levels[1:-1] * sensor.v_sat_v / sensor.v_per_e[0]
+    reach = math.ceil(9.0 * sigma_e)
+    first, last = np.searchsorted(transitions_e, [charge[0] - reach, well_e + reach])
+    survival = np.zeros(last - first)
+    for start in range(first, last, 4096):
+        at_e = transitions_e[start : min(start + 4096, last), np.newaxis]
+        # All charges from 9 standard deviations above a transition are above it, and those as far below are below it.
+        near = np.searchsorted(charge, at_e - reach) + np.arange(2 * reach + 2)
+        weight = np.where(near < charge.size, probability[np.minimum(near, charge.size - 1)], 0.0)
+        above = np.append(np.cumsum(probability[::-1])[::-1], 0.0)[np.minimum(near[:, -1] + 1, charge.size)]
+        normal = scipy.special.ndtr((charge[np.minimum(near, charge.size - 1)] - at_e) / sigma_e)
+        survival[start - first : start - first + at_e.size] = (weight * normal).sum(axis=1) + above
+    weights = -np.diff(np.concatenate([[1.0], survival, [0.0]]))
+    codes = np.arange(weights.size)
+    mean = weights @ codes
+    return first + mean, weights @ (codes - mean) ** 2
+
+
+@pytest.mark.slow(keep=3)
+@pytest.mark.parametrize(
+    ("well_e", "bits"), [*zip(np.geomspace(100.0, 20_000.0, 20).round().tolist(), (8, 14, 10, 12, 8) * 4, strict=True)]
+)
+def test_prediction_around_full_well_equals_sums(well_e, bits):
+    """Levels from 0.3 to 3 wells, and those whose distribution begins just below the well, which noise crosses."""
+    sigma_e, distances = 3.0, np.linspace(5.0, 9.0, 16)
+    # The distance is in standard deviations of the level.
+    above_e = np.square(0.5 * distances + np.sqrt(0.25 * distances**2 + well_e))
+    levels_e = np.append(np.geomspace(0.3, 3.0, 24) * well_e, above_e)
+    options = {"bits": bits, "read_noise_e": sigma_e, "full_well_e": well_e}
+    sensor = sensor_at(0.9 * 2**bits / well_e, **options)
+    found = sensor_at(0.9 * 2**bits / well_e, levels_e.size, **options).predict(levels_e)
+    for level_e, mean_dn, variance_dn2 in zip(levels_e, *found, strict=True):
+        mean, variance = clipped_moments_by_sums(sensor, level_e, sigma_e)
+        assert mean_dn == pytest.approx(mean, abs=1e-6, rel=1e-9), level_e
+        assert variance_dn2 == pytest.approx(variance, abs=1e-6, rel=1e-6), level_e
+
+
 @pytest.mark.parametrize("sigma_e", [0.0, 0.3, 1.0, 1.5, 3.0])
 def test_prediction_near_range_end_equals_sums(sigma_e):
     sensor = sensor_at(1.0, bits=10, read_noise_e=sigma_e)
