@@ -376,8 +376,14 @@ def wavelengths_nm(name: str, value: ArrayLike) -> Floats:
     return read_only(waves_nm.copy())
 
 
-def band_widths_nm(wavelength_nm: Floats, band_width_nm: ArrayLike | None) -> Floats:
-    """Return the specified widths of bands, or widths halfway to the adjacent wavelengths."""
+def band_widths_nm(
+    wavelength_nm: Floats, band_width_nm: ArrayLike | None, range_nm: tuple[float, float] = (0.0, math.inf)
+) -> Floats:
+    """
+    Return the specified widths of bands, or widths halfway to the adjacent wavelengths.
+
+    The latter end at the ends of the range, such as that of a tabulated spectrum.
+    """
     if band_width_nm is not None:
         widths = finite_array("band_width_nm", band_width_nm, above=0.0, at_most=MAX_WAVELENGTH_NM)
         if widths.ndim > 1 or widths.size not in (1, wavelength_nm.size):
@@ -393,9 +399,12 @@ def band_widths_nm(wavelength_nm: Floats, band_width_nm: ArrayLike | None) -> Fl
     steps = np.diff(wavelength_nm[order])
     if np.any(steps <= 0):
         raise ParameterError("wavelength_nm", "must be unique", wavelength_nm.tolist(), "nm")
-    # The outermost bands are symmetric about their wavelengths.
+    # The outermost bands are symmetric about their wavelengths, within the range.
+    below, above = 0.5 * np.concatenate((steps[:1], steps)), 0.5 * np.concatenate((steps, steps[-1:]))
+    below[0] = min(below[0], wavelength_nm[order[0]] - range_nm[0])
+    above[-1] = min(above[-1], range_nm[1] - wavelength_nm[order[-1]])
     widths = np.empty(wavelength_nm.size)
-    widths[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
+    widths[order] = below + above
     return widths
 
 

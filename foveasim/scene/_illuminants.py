@@ -23,6 +23,8 @@ DAYLIGHTS_K = {
 }
 #: Normalisation wavelength of relative spectra.
 REFERENCE_NM = 560.0
+#: Range of the tables of daylight, of the standard observer, and of the colour chart.
+TABLES_NM = (380.0, 780.0)
 #: Planck's second constant and the temperature that define illuminant A (CIE 15).
 PLANCK_NM_K, ILLUMINANT_A_K = 1.435e7, 2848.0
 

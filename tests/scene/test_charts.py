@@ -419,6 +419,20 @@ def test_colour_error_of_few_basis_images(n_basis, mean, worst, illuminant):
     assert difference.max() < worst
 
 
+@pytest.mark.parametrize("illuminant", ["D65", "A"])
+@pytest.mark.parametrize("step_nm", [2.0, 5.0, 10.0])
+def test_photons_are_independent_of_band_width(illuminant, step_nm):
+    """Bands end with the tables, at 380 and 780 nm; the trapezoidal rule has an error of second order."""
+
+    def photons(step_nm):
+        waves_nm = np.arange(380.0, 780.1, step_nm)
+        scene = colours(wavelength_nm=waves_nm, illuminant=illuminant, radiance_w_m2_sr_nm=0.3, n_basis=2)
+        assert scene.band_width_nm.sum() == pytest.approx(400.0)
+        return float((charts.illuminant(illuminant, waves_nm) * waves_nm * scene.band_width_nm).sum())
+
+    assert photons(step_nm) == pytest.approx(photons(1.0), rel=3e-4)
+
+
 def test_few_wavelengths_are_exact():
     waves_nm = [620.0, 550.0, 455.0]
     scene = colours(wavelength_nm=waves_nm, radiance_w_m2_sr_nm=0.3, illuminant="D65")

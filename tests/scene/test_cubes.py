@@ -537,6 +537,9 @@ def test_reflectance_is_lit_by_illuminant(tmp_path):
     table = {"wavelength_nm": [400.0, 500.0, 700.0], "value": [0.0, 1.0, 3.0]}
     tabulated = radiance(Scene.from_cube(path, **options, illuminant=table))
     percent = radiance(Scene.from_cube(path, **(options | {"unit": "%"}), scale=100.0))
+    ends = {"wavelength_nm": [WAVES[0], WAVES[-1]], "value": [1.0, 1.0]}
+    widths_nm = Scene.from_cube(path, **options, illuminant=ends).band_width_nm
+    assert widths_nm.sum() == pytest.approx(np.ptp(WAVES))  # bands end with the table
 
     np.testing.assert_allclose(daylight, VALUES / 100 * 0.3 * illuminant("D65", WAVES)[:, None, None], rtol=1e-12)
     np.testing.assert_allclose(tabulated, VALUES / 100 * 0.3 * np.array([0.5, 1.5, 2.5])[:, None, None], rtol=1e-12)

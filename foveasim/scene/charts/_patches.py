@@ -8,8 +8,8 @@ from typing import Annotated, Unpack
 import numpy as np
 
 from foveasim._core.calls import NOT_NEGATIVE, POSITIVE, Limits
-from foveasim._core.validation import Floats
-from foveasim.scene._illuminants import Illuminant
+from foveasim._core.validation import Floats, band_widths_nm, wavelengths_nm
+from foveasim.scene._illuminants import TABLES_NM, Illuminant
 from foveasim.scene._illuminants import illuminant as cie_illuminant
 from foveasim.scene._photometry import level_of_white
 from foveasim.scene._scene import RADIANCE, Scene
@@ -159,6 +159,9 @@ def colour_chart(
     >>> scene.basis.shape, scene.wavelength_nm.size
     ((12, 90, 120), 31)
     """
+    if raster.get("band_width_nm") is None:
+        waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
+        raster["band_width_nm"] = band_widths_nm(waves_nm, None, TABLES_NM).tolist()
     canvas = Canvas(radiance_w_m2_sr_nm=1.0, wavelength_nm=wavelength_nm, **raster)
     step_mm = patch_mm + gap_mm
     canvas.check_fits("patch_mm", N_COLUMNS * step_mm - gap_mm, N_ROWS * step_mm - gap_mm)

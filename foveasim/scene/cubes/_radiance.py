@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from foveasim._io.formats import FormatError
 from foveasim._io.mapped_files import value_range
 from foveasim._io.rasters.units import Powers, parse_unit, round_factor
 from foveasim.errors import FoveasimWarning, ParameterError
-from foveasim.scene._illuminants import Illuminant
+from foveasim.scene._illuminants import TABLES_NM, Illuminant
 from foveasim.scene._illuminants import illuminant as cie_illuminant
 from foveasim.scene._photometry import level_of_white, the_only
 from foveasim.scene.cubes._cube import Cube, Quantity
@@ -93,7 +94,6 @@ def spectral_radiance(
         weights = interpolation_weights(bands_nm, waves_nm)
     spectrum, max_fraction, relative = factor[:, np.newaxis] * weights, 0.0, None
     own_nm = cube.band_width_nm if band_width_nm is None and resample_nm is None else band_width_nm
-    widths_nm = band_widths_nm(waves_nm, own_nm)
     level = {"luminance_cd_m2": luminance_cd_m2, "illuminance_lux": illuminance_lux}
     if kind == "reflectance":
         bands = (cube.data[k : k + 1] for k in range(factor.size))
@@ -102,7 +102,8 @@ def spectral_radiance(
         the_only({name: white, **level})
         if white is not None:
             white = check_number(name, white, at_least=0.0)
-        relative = _illumination(waves_nm, illuminant)
+        relative, range_nm = _illumination(waves_nm, illuminant)
+        widths_nm = band_widths_nm(waves_nm, own_nm, range_nm)
         spectrum = (
             spectrum
             * relative
@@ -117,6 +118,7 @@ def spectral_radiance(
             )
         )
     else:
+        widths_nm = band_widths_nm(waves_nm, own_nm)
         given = {"illuminant": illuminant, "radiance_w_m2_sr_nm": radiance_w_m2_sr_nm, **level}
         for name, value in given.items():
             if value is not None:
@@ -170,22 +172,25 @@ def _parse(text: str, bands_nm: Floats) -> tuple[Quantity | None, Floats, str]:
     return None, ones, "is neither a spectral radiance nor a reflectance"
 
 
-def _illumination(waves_nm: Floats, illuminant: Illuminant | IlluminantTable | None) -> Floats:
-    """Return the relative spectrum of a white of reflectance 1, (n_wavelength,)."""
+def _illumination(
+    waves_nm: Floats, illuminant: Illuminant | IlluminantTable | None
+) -> tuple[Floats, tuple[float, float]]:
+    """Return the relative spectrum of a white of reflectance 1, (n_wavelength,), and the range in which it is known, nm."""
     if isinstance(illuminant, Mapping):
         return _table(illuminant, waves_nm)
     try:
-        return cie_illuminant(illuminant or "D65", waves_nm)
+        relative = cie_illuminant(illuminant or "D65", waves_nm)
     except ParameterError as error:
         raise ParameterError(
             "illuminant",
             f"'{illuminant or 'D65'}' {error.detail}; select range_nm=, or pass 'A', 'E', or a table "
             "{'wavelength_nm': [...], 'value': [...]}",
         ) from None
+    return relative, (0.0, math.inf) if illuminant in ("A", "E") else TABLES_NM
 
 
-def _table(table: IlluminantTable, waves_nm: Floats) -> Floats:
-    """Return a table of an illuminant, interpolated linearly."""
+def _table(table: IlluminantTable, waves_nm: Floats) -> tuple[Floats, tuple[float, float]]:
+    """Return a table of an illuminant, interpolated linearly, and its range."""
     if set(table) != {"wavelength_nm", "value"}:
         raise ParameterError("illuminant", "must have the keys 'wavelength_nm' and 'value'", sorted(map(str, table)))
     at_nm = wavelengths_nm("illuminant.wavelength_nm", table["wavelength_nm"])
@@ -199,4 +204,4 @@ def _table(table: IlluminantTable, waves_nm: Floats) -> Floats:
             [float(at_nm[0]), float(at_nm[-1])],
             "nm",
         )
-    return np.interp(waves_nm, at_nm, value)
+    return np.interp(waves_nm, at_nm, value), (float(at_nm[0]), float(at_nm[-1]))
