@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -66,16 +67,33 @@ def find_preset(name: str) -> Preset:
 
 
 def _measured(
-    title: str, source: str, *, pixel_um: float, full_well_e: float, read_noise_e: float, bits: int
+    title: str,
+    source: str,
+    *,
+    pixel_um: float,
+    full_well_e: float,
+    total_noise_e: float,
+    bits: int,
+    pedestal_dn: int = 0,
 ) -> Preset:
-    """Return the preset of a pixel: full wells proportional to the area, equal read noise."""
-    capacitance_f = full_well_e * ELEMENTARY_CHARGE_C / SWING_V
-    return Preset(
-        title,
-        source,
-        {"read_noise_e": read_noise_e, "v_sat_v": SWING_V, "bits": bits, "cds": True},
-        {"capacitance_f": capacitance_f / pixel_um**2},
-    )
+    """
+    Return the preset of a pixel: full wells proportional to the area, equal read noise.
+
+    A published noise is measured in codes, and contains quantisation: its 1/12 DN² is subtracted in quadrature. Above the
+    pedestal, the remaining codes are those of the full well.
+    """
+    pedestal = pedestal_dn / 2**bits
+    e_per_dn = full_well_e / (2**bits * (1.0 - pedestal))
+    capacitance_f = full_well_e * ELEMENTARY_CHARGE_C / (SWING_V * (1.0 - pedestal))
+    parameters = {
+        "read_noise_e": round(math.sqrt(total_noise_e**2 - e_per_dn**2 / 12.0), 4),
+        "v_sat_v": SWING_V,
+        "bits": bits,
+        "cds": True,
+    }
+    if pedestal_dn:
+        parameters["pedestal_v"] = pedestal * SWING_V
+    return Preset(title, source, parameters, {"capacitance_f": capacitance_f / pixel_um**2})
 
 
 #: Presets by name: ``fs.Sensor.from_preset(layout, "machine_vision")``, and the key ``preset`` of settings files. Full wells of
@@ -86,19 +104,20 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
         "mobile": _measured(
             "mobile camera, pixels of 1.4 µm",
             "OmniVision OV5647 as specified in the OptArc AF51 user guide, v1.02, p. 21: well capacity 4,300 e-, dynamic range "
-            "68 dB, which is a read noise of 1.7 e-; 10 bits",
+            "68 dB, which is a noise of 1.71 e- in codes; 10 bits, with a pedestal of 16 codes, above the noise",
             pixel_um=1.4,
             full_well_e=4300.0,
-            read_noise_e=1.7,
+            total_noise_e=1.71,
             bits=10,
+            pedestal_dn=16,
         ),
         "machine_vision": _measured(
             "machine vision, global shutter, pixels of 3.45 µm",
             "Sony IMX250 in the Genie Nano M2450, Teledyne DALSA manual, p. 42: full well 10,700 e-, dynamic range 75.46 dB, "
-            "which is a read noise of 1.8 e-; 12 bits",
+            "which is a noise of 1.8 e- in codes; 12 bits",
             pixel_um=3.45,
             full_well_e=10_700.0,
-            read_noise_e=1.8,
+            total_noise_e=1.804,
             bits=12,
         ),
         "scientific": _measured(
@@ -107,7 +126,7 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
             "560 MHz; 16 bits",
             pixel_um=6.5,
             full_well_e=30_000.0,
-            read_noise_e=1.38,
+            total_noise_e=1.38,
             bits=16,
         ),
         **{

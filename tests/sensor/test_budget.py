@@ -12,7 +12,7 @@ import foveasim as fs
 from foveasim.errors import ParameterError
 from foveasim.layout import grid
 from foveasim.sensor import FIXED, PRESETS, TEMPORAL, Diffusion, Sensor, noise_budget
-from foveasim.units import ELEMENTARY_CHARGE_C
+from foveasim.units import ELEMENTARY_CHARGE_C, electrons_to_volts
 
 N = 400
 LINE = grid(n_x=N, n_y=1, pitch_um=2.0).with_columns(readout_line=np.arange(N))
@@ -137,16 +137,33 @@ def test_presets_match_published_parameters(name, published):
     [
         ("mobile", 1.4, 4300, 68.0, 10),
         ("machine_vision", 3.45, 10_700, 75.46, 12),
-        ("scientific", 6.5, 30_000, 86.7, 16),
+        ("scientific", 6.5, 30_000, 86.74, 16),
     ],
 )
 def test_presets_have_published_dynamic_range(name, pixel_um, full_well_e, dynamic_range_db, bits):
-    pixels = grid(n_x=3, n_y=2, pitch_um=pixel_um)
+    """The noise of a data sheet is that of the codes of dark frames: with quantisation, here at 16 positions in a code."""
+    pixels = grid(n_x=100, n_y=20, pitch_um=pixel_um)
     sensor = Sensor.from_preset(pixels, name)
+    code_v = sensor.v_sat_v / 2**bits
 
     assert sensor.bits == bits
-    assert sensor.capacitance_f * sensor.v_sat_v / ELEMENTARY_CHARGE_C == pytest.approx(np.full(6, full_well_e))
-    assert 20.0 * np.log10(full_well_e / sensor.read_noise_e) == pytest.approx(dynamic_range_db, abs=0.1)
+    swing_v = sensor.v_sat_v - sensor.pedestal_v
+    assert sensor.capacitance_f * swing_v / ELEMENTARY_CHARGE_C == pytest.approx(np.full(2000, full_well_e))
+    errors_dn = []
+    for k in range(16):
+        pedestal_dn = 100.0 + k / 16.0
+        dark = Sensor.from_preset(pixels, name, pedestal_v=pedestal_dn * code_v)
+        errors_dn.append(dark.read(np.zeros(2000), seed=k) - (pedestal_dn - 0.5))
+    noise_e = np.sqrt(np.mean(np.square(errors_dn))) * code_v / electrons_to_volts(1.0, sensor.capacitance_f[0])
+    assert 20.0 * np.log10(full_well_e / noise_e) == pytest.approx(dynamic_range_db, abs=0.1)
+
+
+def test_noise_of_mobile_preset_is_not_clipped():
+    sensor = Sensor.from_preset(grid(n_x=40, n_y=25, pitch_um=1.4), "mobile")
+    codes = sensor.read(np.zeros(1000), seed=0).astype(float)
+
+    assert codes.min() > 0
+    assert codes.mean() == pytest.approx(15.5, abs=0.1)  # 16, less half a code of truncation
 
 
 def test_presets_scale_with_area():
@@ -155,7 +172,7 @@ def test_presets_scale_with_area():
     density = np.asarray(sensor.capacitance_f) * sensor.v_sat_v / ELEMENTARY_CHARGE_C / layout.area_um2
 
     assert density == pytest.approx(np.full(layout.n_sites, 10_700 / 3.45**2))
-    assert (sensor.bits, sensor.dark_e_per_s, sensor.read_noise_e) == (8, 5.0, 1.8)
+    assert (sensor.bits, sensor.dark_e_per_s, sensor.read_noise_e) == (8, 5.0, 1.6388)
     with pytest.raises(
         ParameterError, match="'preset' must be the name of a preset, got 'machine_visoin'; did you mean"
     ):
