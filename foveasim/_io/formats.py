@@ -76,6 +76,21 @@ class FormatError(Exception):
     """Invalid content of a file; the message does not contain the path."""
 
 
+def listed_file(index: Path, name: str, *, allow_outside: bool = False) -> Path:
+    """
+    Return the path of a file that an index names, relative to its directory.
+
+    Raises FormatError when it is in another directory, without ``allow_outside``, or does not exist. The message does not tell
+    whether a file outside exists.
+    """
+    file = index.parent / name
+    if not allow_outside and not file.resolve().is_relative_to(index.parent.resolve()):
+        raise FormatError(f"lists {name!r:.80}, outside its directory; move the file, or pass allow_outside=True")
+    if not file.is_file():
+        raise FormatError(f"lists {name!r:.80}, which does not exist")
+    return file
+
+
 @contextmanager
 def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], ...] = ()) -> Iterator[None]:
     """

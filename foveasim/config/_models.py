@@ -242,7 +242,7 @@ def _models(_versions: tuple[int, ...]) -> Models:
         pupil=pupil | list[pupil] | None,  # type: ignore[valid-type]
         zernike=_model("zernike", Zernike) | None,
         seidel=_model("seidel", Seidel) | None,
-        psfs=_model("PSFs", read_psfs, **_FILE_TYPES) | None,
+        psfs=_model("PSFs", read_psfs, skip=("allow_outside",), **_FILE_TYPES) | None,
         relative_illumination=_model("relative illumination table", IlluminationTable) | None,
         lateral_colour=_model("lateral colour", LateralColour) | None,
         exit_pupil_mm=float | None,

@@ -753,6 +753,32 @@ def test_wrong_indices_are_rejected(tmp_path, entries, message):
     assert "lens.yaml" in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["../{}.txt", "{folder}/{}.txt", "link_{}.txt", "sub/../../{}.txt"])
+def test_index_does_not_leave_its_directory(tmp_path, name):
+    """The message is equal for files that exist and others."""
+    folder = tmp_path / "lens"
+    (folder / "sub").mkdir(parents=True)
+    index_of(tmp_path, ENTRIES[:1])
+    messages = []
+    for stem in ("a", "missing"):
+        (folder / f"link_{stem}.txt").symlink_to(tmp_path / f"{stem}.txt")
+        file = name.format(stem, folder=tmp_path)
+        index = folder / "lens.yaml"
+        index.write_text(f"psfs: [{{file: '{file}', x_um: 0.0, y_um: 0.0, wavelength_nm: 500.0}}]\n")
+        with pytest.raises(
+            FileError, match="outside its directory; move the file, or pass allow_outside=True"
+        ) as caught:
+            read_psfs(index)
+        messages.append(str(caught.value).replace(file, ""))
+        if stem == "a":
+            assert read_psfs(index, allow_outside=True).wavelength_nm.tolist() == [500.0]
+    assert messages[0] == messages[1]
+    shot = fs.config.read_settings(fs.config.demo_settings()[0])
+    shot["optics"]["psfs"] = {"path": str(index), "allow_outside": True}
+    with pytest.raises(fs.errors.ConfigError, match=r"optics\.psfs\.allow_outside: unknown"):
+        fs.config.build_shot(None, shot)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -29,7 +29,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
 }
 
 
-def read_psfs(path: str | Path) -> PSFGrid:
+def read_psfs(path: str | Path, *, allow_outside: bool = False) -> PSFGrid:
     """
     Read point spread functions from a file.
 
@@ -38,6 +38,8 @@ def read_psfs(path: str | Path) -> PSFGrid:
     path : path
         An ``.npz`` or FITS stack, a text export of Zemax OpticStudio, or a YAML index of such exports: see the guide of the
         optics.
+    allow_outside : bool
+        Whether an index may name files outside its directory. Settings files never allow it.
 
     Returns
     -------
@@ -46,7 +48,7 @@ def read_psfs(path: str | Path) -> PSFGrid:
     Raises
     ------
     FileError
-        When a file is missing, too large, of another format, or not consistent.
+        When a file is missing, outside the directory of its index, too large, of another format, or not consistent.
 
     Examples
     --------
@@ -65,7 +67,9 @@ def read_psfs(path: str | Path) -> PSFGrid:
     _, form = detect_format(source, PSF_FORMATS, "file of PSFs")
     assert form.read is not None
     with as_file_error(source, "file of PSFs", passes=(FileError,)):
-        found = form.read(source)
+        found = form.read(
+            source, **{"allow_outside": True} if allow_outside and "allow_outside" in form.read_options else {}
+        )
         if not isinstance(found, PSFGrid):
             raise FormatError(f"must be read as a PSFGrid, got {type(found).__name__}")
         return found

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from foveasim._core.validation import Floats
-from foveasim._io.formats import FileFormat, FormatError, as_file_error
+from foveasim._io.formats import FileFormat, FormatError, as_file_error, listed_file
 from foveasim._io.text_files import read_text
 from foveasim._io.yaml_files import MAX_FILE_BYTES as MAX_INDEX_BYTES
 from foveasim._io.yaml_files import parse_yaml
@@ -133,8 +133,8 @@ def read_one(path: Path) -> PSFGrid:
     )
 
 
-def read_index(path: Path) -> PSFGrid:
-    """Read an index and its listings."""
+def read_index(path: Path, *, allow_outside: bool = False) -> PSFGrid:
+    """Read an index and its listings, which are in its directory unless ``allow_outside``."""
     about = parse_yaml(path, read_text(path, "an index of PSFs", MAX_INDEX_BYTES))
     entries = _entries(about)
     points = list(dict.fromkeys((entry["x_um"], entry["y_um"]) for entry in entries))
@@ -158,13 +158,14 @@ def read_index(path: Path) -> PSFGrid:
         missing = next(entry["file"] for entry in entries if "relative_illumination" not in entry)
         raise FormatError(f"has 'relative_illumination' for some files only; add it to {missing!r:.80}")
     fraction = np.ones((len(points), len(waves_nm)))
-    first = _listed(path, entries[0], None)
+    listed = [listed_file(path, entry["file"], allow_outside=allow_outside) for entry in entries]
+    first = _listed(path, entries[0], listed[0], None)
     n_values = len(entries) * first.values.size
     if n_values > MAX_VALUES:
         raise FormatError(f"lists {n_values} values, more than the limit of {MAX_VALUES}")
     stack = np.empty((len(points), len(waves_nm), *first.values.shape))
     for number, entry in enumerate(entries):
-        one = _listed(path, entry, (entries[0]["file"], first)) if number else first
+        one = _listed(path, entry, listed[number], (entries[0]["file"], first)) if number else first
         at = points.index((entry["x_um"], entry["y_um"])), waves_nm.index(entry["wavelength_nm"])
         stack[at], fraction[at] = one.values, entry.get("relative_illumination", 1.0)
     x_um, y_um = np.array(points).T
@@ -181,11 +182,8 @@ def read_index(path: Path) -> PSFGrid:
     )
 
 
-def _listed(index: Path, entry: dict[str, Any], reference: tuple[str, Listing] | None) -> Listing:
+def _listed(index: Path, entry: dict[str, Any], file: Path, reference: tuple[str, Listing] | None) -> Listing:
     """Read the listing of an entry, which must be as the first one."""
-    file = index.parent / entry["file"]
-    if not file.is_file():
-        raise FormatError(f"lists {entry['file']!r:.80}, which does not exist")
     with as_file_error(file, "listing of a PSF", passes=(FileError,)):
         one = read_listing(file)
         if abs(one.wavelength_nm - entry["wavelength_nm"]) > SAME * one.wavelength_nm:
@@ -284,6 +282,12 @@ PSF_FORMATS.register(
 )
 PSF_FORMATS.register(
     "zemax_index",
-    FileFormat(title="index of Zemax listings", suffixes=(".yaml", ".yml"), matches=_is_index, read=read_index),
+    FileFormat(
+        title="index of Zemax listings",
+        suffixes=(".yaml", ".yml"),
+        matches=_is_index,
+        read=read_index,
+        read_options=("allow_outside",),
+    ),
     example=_example_index,
 )
