@@ -35,6 +35,8 @@ OWN_CHECK = "checked by the call"
 OwnCheck = Annotated[T, OWN_CHECK]
 #: Words for the lengths of sequences.
 COUNTS = {1: "one", 2: "two", 3: "three", 4: "four"}
+#: Longest name of a file, and longest path, of the usual file systems.
+MAX_NAME_BYTES, MAX_PATH_BYTES = 255, 4095
 
 
 class Kind(NamedTuple):
@@ -57,6 +59,9 @@ class Kind(NamedTuple):
 def check_kind(name: str, value: Any, kind: Kind) -> None:
     """Check that a value is of a kind."""
     if not kind.accepts(value):
+        if isinstance(value, str | os.PathLike) and _PATH.one in kind.one and _is_too_long(value):
+            rule = f"must have names of at most {MAX_NAME_BYTES} bytes, and {MAX_PATH_BYTES} in all"
+            raise ParameterError(name, rule, f"{os.fspath(value)!s:.60}...")
         if kind.item is not None and _is_sequence(value):
             for k, each in enumerate(value):
                 check_kind(f"{name}[{k}]", each, kind.item)
@@ -312,7 +317,16 @@ def _has(value: object, name: str) -> bool:
 
 
 def _accepts_path(value: Any) -> bool:
-    return isinstance(value, str | os.PathLike)
+    return isinstance(value, str | os.PathLike) and not _is_too_long(value)
+
+
+def _is_too_long(value: Any) -> bool:
+    """Whether a path has a name that file systems reject, for which pathlib raises an OSError of its own."""
+    path = os.fspath(value)
+    if len(path) <= MAX_NAME_BYTES // 4:  # the common case: of at most 4 bytes per character
+        return False
+    name = os.fsencode(path)
+    return len(name) > MAX_PATH_BYTES or any(len(part) > MAX_NAME_BYTES for part in name.split(os.fsencode(os.sep)))
 
 
 def _accepts_number(value: Any) -> bool:
