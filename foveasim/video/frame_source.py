@@ -15,12 +15,13 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.calls import POSITIVE, Limits
+from foveasim._core.calls import Limits
 from foveasim._core.names import missing_path, possible_names
 from foveasim._io.images import PICTURE_EXTENSIONS, picture_names
 from foveasim._io.videos import VideoFile, frame_pixels
 from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.scene import Scene
+from foveasim.sensor.limits import DURATION
 
 __all__ = ["FrameSource", "list_pictures"]
 
@@ -78,7 +79,7 @@ class FrameSource:
         start: Annotated[int, FRAMES] = 0,
         stop: Annotated[int | None, FRAMES] = None,
         step: Annotated[int, Limits(at_least=1, at_most=MAX_FRAMES)] = 1,
-        frame_s: Annotated[float | None, POSITIVE] = None,
+        frame_s: Annotated[float | None, DURATION] = None,
         template: Scene | None = None,
         **scene: Any,
     ) -> None:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.calls import NOT_NEGATIVE, POSITIVE, OwnCheck
+from foveasim._core.calls import NOT_NEGATIVE, OwnCheck
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
@@ -23,6 +23,7 @@ from foveasim.errors import FileError, ParameterError, format_value
 from foveasim.fields import PowerMap
 from foveasim.optics import Optics
 from foveasim.scene import Scene
+from foveasim.sensor.limits import DURATION
 
 __all__ = ["GazePath", "follow_gaze", "pan_camera", "saccades", "shift_sensor"]
 
@@ -193,8 +194,8 @@ def _is_row(row: Any) -> bool:
 
 def saccades(
     *,
-    duration_s: Annotated[float, POSITIVE],
-    frame_s: Annotated[float, POSITIVE],
+    duration_s: Annotated[float, DURATION],
+    frame_s: Annotated[float, DURATION],
     size_um: tuple[float, float],
     seed: int,
     fixation_s: float = 0.3,
@@ -291,7 +292,7 @@ def follow_gaze(
     frames: Iterable[Scene | PowerMap],
     path: GazePath,
     *,
-    frame_s: Annotated[float, POSITIVE],
+    frame_s: Annotated[float, DURATION],
     first_frame: Annotated[int, NOT_NEGATIVE] = 0,
 ) -> Iterator[tuple[Scene | PowerMap, tuple[float, float]]]:
     """

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.calls import POSITIVE, Limits
+from foveasim._core.calls import Limits
 from foveasim._core.extras import import_optional
 from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim._io.images import write_picture
@@ -22,6 +22,7 @@ from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.reconstruct import fill_channels, raster_grid
 from foveasim.reconstruct.picture import raster_of
+from foveasim.sensor.limits import DURATION
 from foveasim.video.recording import check_consistent, count_recorded_frames, record, resume_recording
 
 __all__ = ["write_video"]
@@ -30,12 +31,15 @@ VIDEO_EXTENSIONS = (".mp4", ".mkv", ".mov", ".webm")
 #: Background grey where there are no photosites, as a fraction of white.
 BACKGROUND_GREY = 0.12
 
+#: Shortest time between the frames of a video file: rates are ratios of integers of 32 bits.
+MIN_FILE_FRAME_S = 1e-6
+
 
 def write_video(
     captures: Iterable[Capture],
     path: str | Path,
     *,
-    frame_s: Annotated[float, POSITIVE] = 1.0 / 25.0,
+    frame_s: Annotated[float, DURATION] = 1.0 / 25.0,
     max_pixels: Annotated[int, Limits(at_least=2)] = 512,
     n_frames: int | None = None,
     progress: bool = False,
@@ -214,8 +218,18 @@ def _write_gif(captures: Iterable[Capture], target: Path, frame_s: float, max_pi
     return n_frames
 
 
+def _frame_rate(frame_s: float) -> Fraction:
+    """Return a frame rate in 1/s, as a ratio of small integers such as 30000/1001."""
+    if frame_s < 1.0:
+        return Fraction(1.0 / frame_s).limit_denominator(1001)
+    return 1 / Fraction(frame_s).limit_denominator(1001)
+
+
 def _write_video_file(captures: Iterable[Capture], target: Path, frame_s: float, max_pixels: int) -> int:
     av = import_optional(target, "av")
+    if frame_s < MIN_FILE_FRAME_S:
+        hint = "a .zarr store has any frame rate"
+        raise ParameterError("frame_s", f"must be >= {MIN_FILE_FRAME_S:g} in a video file", frame_s, "s", hint)
     codec = "libvpx-vp9" if target.suffix.lower() == ".webm" else "libx264"
     n_frames = 0
     with atomic_write(target) as temporary:
@@ -227,7 +241,7 @@ def _write_video_file(captures: Iterable[Capture], target: Path, frame_s: float,
                     raster = raster or _Raster(capture.layout, max_pixels, has_even_size=True)
                     pixels = raster.composite(capture)
                     if stream is None:
-                        stream = container.add_stream(codec, rate=Fraction(1.0 / frame_s).limit_denominator(1001))
+                        stream = container.add_stream(codec, rate=_frame_rate(frame_s))
                         stream.height, stream.width = pixels.shape[:2]
                         stream.pix_fmt = "yuv420p"
                     container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))

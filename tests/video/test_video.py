@@ -773,6 +773,31 @@ def test_only_recordings_are_overwritten(tmp_path):
         assert (tmp_path / name / "notes.txt").read_text() == "text"
 
 
+@pytest.mark.parametrize(
+    ("frame_s", "rate"), [(1.001 / 30.0, "30000/1001"), (0.04, "25"), (2.5, "2/5"), (2000.0, "1/2000")]
+)
+def test_video_file_has_frame_rate(tmp_path, frame_s, rate):
+    av = pytest.importorskip("av")
+    write_video(captures_of(2), tmp_path / "v.mp4", frame_s=frame_s)
+    with av.open(str(tmp_path / "v.mp4")) as container:
+        assert str(container.streams.video[0].base_rate or container.streams.video[0].average_rate) == rate
+
+
+@pytest.mark.parametrize(
+    ("name", "frame_s", "message"),
+    [
+        ("v.mp4", 1e-20, "'frame_s' must be"),
+        ("v.mp4", 1e-7, "'frame_s' must be >= 1e-06 in a video file, got 1e-07 s; a .zarr store has any frame rate"),
+        ("v.gif", 1e-20, "'frame_s' must be"),
+        ("v.zarr", np.inf, "'frame_s' must be"),
+    ],
+)
+def test_implausible_frame_rates_are_rejected(tmp_path, name, frame_s, message):
+    with pytest.raises(ParameterError, match=message):
+        write_video(captures_of(1), tmp_path / name, frame_s=frame_s)
+    assert not (tmp_path / name).exists()
+
+
 def test_written_pictures_match_captures(tmp_path):
     from foveasim._io.images import read_picture
 
