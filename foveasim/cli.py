@@ -117,6 +117,8 @@ def run(
     ] = False,
 ) -> None:
     """Simulate the shot of a settings file, and check its requirements."""
+    if any(change.partition("=")[0].strip().startswith("gaze_path") for change in changes or []):
+        _exit("error: --set gaze_path: only videos follow a path; use gaze_um, or foveasim video", BAD_INPUT)
     (result,) = _run([settings], [*(changes or []), *_layout_changes(layer, channels, cell, centre)], out, threads)
     if require and not result.shot.requirements:
         _exit(f"error: {settings}: contains no requirements", BAD_INPUT)

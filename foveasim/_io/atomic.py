@@ -8,7 +8,7 @@ import secrets
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
@@ -47,6 +47,23 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # a name too long for the system was never created
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_files(*targets: Path) -> Iterator[list[Path]]:
+    """Yield temporary paths that replace all targets if the block succeeds, else none: see :func:`atomic_write`."""
+    problem: FileError | None = None
+    try:
+        with ExitStack() as stack:
+            temporaries = [stack.enter_context(atomic_write(target)) for target in targets]
+            try:
+                yield temporaries
+            except FileError as error:
+                if error.path in temporaries:
+                    problem = FileError(targets[temporaries.index(error.path)], error.detail)
+                raise
+    except FileError as error:
+        raise problem or error from None
 
 
 @contextmanager

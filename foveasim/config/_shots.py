@@ -14,6 +14,7 @@ import shapely
 from rich.table import Table
 
 from foveasim._core.short_repr import short_repr
+from foveasim._io.atomic import atomic_files
 from foveasim._io.terminal import as_plain_text
 from foveasim.capture import Capture
 from foveasim.config import Shot
@@ -68,7 +69,7 @@ def write_results(shot: Shot, capture: Capture, directory: str | Path) -> tuple[
     shot : Shot
     capture : Capture
     directory : path
-        Created when missing. Each file is written atomically.
+        Created when missing. All files are written, or none.
 
     Returns
     -------
@@ -87,16 +88,15 @@ def write_results(shot: Shot, capture: Capture, directory: str | Path) -> tuple[
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileError(directory, f"cannot be created: {error.strerror or error}") from None
-    picture, layout, saved = (
-        directory / f"{shot.name}_{part}" for part in ("picture.png", "layout.png", "capture.npz")
-    )
-    capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn)
-    with hidden_figures():
-        axes = plot_capture(capture)
-    axes.set_title(f"{printable(shot.name)}: {capture.layout.n_sites} photosites", parse_math=False)
-    save_figure(axes.figure, layout)  # type: ignore[arg-type]
-    capture.save(saved)
-    return [picture, layout, saved], time.perf_counter() - start_s
+    paths = [directory / f"{shot.name}_{part}" for part in ("picture.png", "layout.png", "capture.npz")]
+    with atomic_files(*paths) as (picture, layout, saved):
+        capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn)
+        with hidden_figures():
+            axes = plot_capture(capture)
+        axes.set_title(f"{printable(shot.name)}: {capture.layout.n_sites} photosites", parse_math=False)
+        save_figure(axes.figure, layout)  # type: ignore[arg-type]
+        capture.save(saved)
+    return paths, time.perf_counter() - start_s
 
 
 @dataclass(frozen=True)

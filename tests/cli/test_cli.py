@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import struct
@@ -18,6 +19,7 @@ from programs import run_program
 
 import foveasim as fs
 from foveasim import config
+from foveasim._io.atomic import atomic_write
 from foveasim._io.images import read_picture
 from foveasim.config import bundled_layouts
 from foveasim.view import find_renderer
@@ -217,6 +219,41 @@ def test_invalid_layout_files_print_one_line(foveasim, tmp_path, arguments, word
     assert result.returncode == 2
     assert result.stderr.startswith(f"error: {words}")
     assert result.stderr.count("\n") == 1
+
+
+SMALL_SHOT = """scene: {kind: flat, shape: [40, 40], pitch_um: 300, distance_m: 1.0, illuminance_lux: 500}
+optics: {focal_length_mm: 8, f_number: 2.8}
+layout: {generator: grid, parameters: {n_x: 9, n_y: 9, pitch_um: 5}}
+exposure_s: 0.01
+"""
+
+
+@pytest.mark.parametrize("failing", ["Picture.save", "Capture.save"])
+def test_run_writes_all_files_or_none(foveasim, tmp_path, monkeypatch, failing):
+    (tmp_path / "shot.yaml").write_text(SMALL_SHOT)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "shot_picture.png").write_bytes(b"of an earlier run")
+
+    def full(_, path, *_arguments, **_options):
+        with atomic_write(path):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr({"Picture.save": fs.reconstruct.Picture, "Capture.save": fs.Capture}[failing], "save", full)
+    result = foveasim("run", "shot.yaml", cwd=tmp_path)
+
+    assert result.returncode == 2
+    name = {"Picture.save": "picture.png", "Capture.save": "capture.npz"}[failing]
+    assert result.stderr == f"error: out/shot_{name}: cannot be written: No space left on device\n"
+    assert [path.read_bytes() for path in (tmp_path / "out").iterdir()] == [b"of an earlier run"]
+
+
+def test_gaze_path_of_a_single_capture_is_rejected(foveasim, tmp_path):
+    (tmp_path / "shot.yaml").write_text(SMALL_SHOT)
+    result = foveasim("run", "shot.yaml", "--set", "gaze_path=[[0, 0, 0], [1, 5, 0]]", cwd=tmp_path)
+
+    assert result.returncode == 2
+    assert result.stderr == "error: --set gaze_path: only videos follow a path; use gaze_um, or foveasim video\n"
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
