@@ -389,8 +389,8 @@ def cameras(
             known = _with_angular_response(camera, light)
             picture = capture.picture(method, of="light_e", per="um2", grid=grid, sensor=known)
             ideal = camera.reference(light, grid, exposure_s=exposure_s)
-            model, measures = scene_measures(_behind_image(camera), capture, _image(camera, light, maps), annuli)
-            shots[name].append(_Shot(picture, ideal, model, known.light_response(), measures))
+            model, own_measures = scene_measures(_behind_image(camera), capture, _image(camera, light, maps), annuli)
+            shots[name].append(_Shot(picture, ideal, model, known.light_response(), own_measures))
             advance()
     covered = [one[0].picture.coverage >= MIN_COVERAGE for one in shots.values()]
     is_common, is_field = (combine(covered, axis=0) for combine in (np.all, np.any))

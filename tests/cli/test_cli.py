@@ -247,7 +247,7 @@ def test_run_writes_all_files_or_none(foveasim, tmp_path, monkeypatch, failing):
     assert [path.read_bytes() for path in (tmp_path / "out").iterdir()] == [b"of an earlier run"]
 
 
-def test_gaze_path_of_a_single_capture_is_rejected(foveasim, tmp_path):
+def test_gaze_path_of_one_capture_is_rejected(foveasim, tmp_path):
     (tmp_path / "shot.yaml").write_text(SMALL_SHOT)
     result = foveasim("run", "shot.yaml", "--set", "gaze_path=[[0, 0, 0], [1, 5, 0]]", cwd=tmp_path)
 

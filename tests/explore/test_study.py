@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -265,12 +267,18 @@ def test_array_objective_is_rejected():
     assert found.trials[0].user_attrs["error"] == "'m' must be a finite number, got an array"
 
 
+def log_margin(shot, camera, capture):
+    """Return a logarithm that is not defined for saturated frames."""
+    return np.log(1.0 - capture.saturated_fraction) if capture.saturated_fraction < 1.0 else math.nan
+
+
 def test_failed_trials_are_reported():
     found = explore.study(
         SHOT,
         {"exposure_s": [1e-4, -1.0, 1.0]},
-        {"snr_mean": "maximize"},
+        {"log_margin": "maximize"},
         n_trials=15,
+        metrics=[log_margin, "n_sites"],
         constraints={"n_sites": (1, None)},
     )
     by_choice = {t.params["exposure_s"]: t for t in found.trials}
@@ -281,7 +289,7 @@ def test_failed_trials_are_reported():
         .user_attrs["error"]
         .endswith("exposure_s: must be >= 0, got -1.0 s; times are in seconds: 1 ms is 1e-3")
     )
-    assert by_choice[1.0].user_attrs["error"] == "'snr_mean' must be a finite number, got nan"
+    assert by_choice[1.0].user_attrs["error"] == "'log_margin' must be a finite number, got nan"
     assert found.best_trial.params["exposure_s"] == 1e-4
 
 

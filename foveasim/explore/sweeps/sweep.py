@@ -155,7 +155,7 @@ def run_sweep(
     >>> plan = fs.explore.plan_sweep(shot, {"optics.f_number": [2.0, 2.8, 4.0]}, metrics=["snr"])
     >>> results = fs.explore.run_sweep(plan, workers=0)  # in this process
     >>> results["snr_mean"].round().values.tolist()
-    [46.0, 33.0, 23.0]
+    [46.0, 33.0, 24.0]
     """
     import_xarray("sweep")  # before hours of work
     if out is None:
