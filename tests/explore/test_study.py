@@ -10,7 +10,7 @@ import pytest
 from foveasim import explore
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, FileError, ParameterError
-from foveasim.explore.studies import study
+from foveasim.explore.studies import plan, study
 
 SHOT = {
     "scene": {
@@ -128,7 +128,7 @@ def stored(path):
 
 def outcomes(study):
     return [
-        (t.params, t.values, t.user_attrs.get("error"))
+        (t.number, t.params, t.values, t.user_attrs.get("error"))
         for t in study.trials
         if not t.user_attrs.get("ended with the program")
     ]
@@ -147,7 +147,7 @@ def test_interrupted_study_resumes_identically(tmp_path):
     again = run(14, storage=tmp_path / "study.db")
 
     assert outcomes(again) == outcomes(complete)
-    assert len(again.trials) == 15
+    assert len(again.trials) == 14
     assert outcomes(run(14, storage=f"sqlite:///{tmp_path}/study.db")) == outcomes(complete)
     assert outcomes(run(14, seed=6)) != outcomes(complete)
 
@@ -176,6 +176,31 @@ def test_batch_size_changes_the_search():
     # The first trials are random in any case.
     assert outcomes(one)[:10] == outcomes(many)[:10]
     assert outcomes(one) != outcomes(many)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_values", [1, 2, 5, 7])
+def test_study_interrupted_between_values_resumes_identically(n_values, tmp_path, monkeypatch, complete_batches):
+    """While the settings of the last batch are sampled."""
+    suggest, store_result, stored_results, calls = plan._suggest, study._store_result, [], []
+
+    def interrupted(*args):
+        calls.extend([None] * (len(stored_results) == 12))
+        if len(calls) > n_values:
+            raise KeyboardInterrupt
+        return suggest(*args)
+
+    def counted(*args):
+        store_result(*args)
+        stored_results.append(None)
+
+    monkeypatch.setattr(plan, "_suggest", interrupted)
+    monkeypatch.setattr(study, "_store_result", counted)
+    with pytest.raises(KeyboardInterrupt):
+        batches(storage=tmp_path / "study.db")
+    monkeypatch.undo()
+
+    assert outcomes(batches(storage=tmp_path / "study.db")) == complete_batches
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import os
 import re
 import secrets
 import sqlite3
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
@@ -194,7 +195,8 @@ def run_study(
                 if progress is not None:
                     progress(n_done, plan.n_trials)
                 with _storage_errors(storage, n_done):
-                    trials = trials or [_ask(optuna, optuna_study, plan, n_done + k) for k in range(plan.batch)]
+                    missing = range(len(trials), plan.batch - n_done % plan.batch)
+                    trials += [_ask(optuna, optuna_study, plan, n_done + k) for k in missing]
                     _check_writer(optuna, storage, trials[-1], token)
                     points = [(trial.number, plan.settings_of(trial)) for trial in trials]
                 records = {
@@ -353,8 +355,8 @@ def _prepare(
     """
     Check that the stored study has the same plan, and register this program as its writer.
 
-    Returns ``trials``: unfinished trials of a batch whose results were only partly stored at an interruption; their settings
-    are sampled already. Trials of a batch without stored results are discarded and sampled again.
+    Returns ``trials``: the trials of a batch that an interruption left without results, with the settings and numbers that they
+    have without one.
     """
     plan_dict = plan.to_dict()
     stored_plan = optuna_study.user_attrs.get(PLAN)
@@ -369,11 +371,22 @@ def _prepare(
     optuna_study.set_user_attr(WRITER, token)
     running = optuna_study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,))
     trials = [optuna.trial.Trial(optuna_study, trial._trial_id) for trial in running]  # noqa: SLF001 -- Optuna has no public way
-    if len(completed_trials(optuna_study)) % plan.batch:
-        return trials
-    for trial in trials:
-        _discard(optuna, trial)
-    return []
+    n_done = len(completed_trials(optuna_study))
+    if trials and n_done % plan.batch == 0:
+        _sample_rest(optuna, optuna_study, trials[-1], plan, n_done + len(trials) - 1)
+    return trials
+
+
+def _sample_rest(optuna: Any, optuna_study: optuna.Study, trial: optuna.Trial, plan: StudyPlan, n: int) -> None:
+    """Sample the settings of trial n that an interruption left without a value, as a copy of the study samples all of them."""
+    copy = optuna.create_study(directions=optuna_study.directions)
+    # Those of the batch without results, too: the sampler avoids their settings.
+    copy.add_trials([each for each in optuna_study.get_trials(deepcopy=False) if each.number != trial.number])
+    params = _ask(optuna, copy, plan, n).params
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        optuna_study.sampler = optuna.samplers.PartialFixedSampler(params, optuna_study.sampler)
+    plan.settings_of(trial)
 
 
 def _discard(optuna: Any, trial: optuna.Trial) -> None:
