@@ -448,6 +448,33 @@ def test_annular_pupils_are_counted_by_rays():
 # -- mixing -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_light_is_collected_once_at_most(seed):
+    """For random ordinary configurations, with enough sites that responses alone are interpolated."""
+    rng = np.random.default_rng(seed)
+    pitch_um, n = rng.uniform(1.0, 3.0), int(rng.integers(40, 90))
+    shapes = (
+        fs.layout.grid(n_x=n, n_y=n, pitch_um=pitch_um),
+        fs.layout.hexagonal(n_columns=n, n_rows=n, pitch_um=pitch_um),
+    )
+    layout = shapes[seed % 2].translate(*rng.uniform(0.0, 2000.0, 2))
+    lens = fs.Optics(focal_length_mm=6.0, f_number=rng.uniform(1.4, 4.0))
+    optics = Microlens(
+        height_um=rng.uniform(1.0, 5.0), refractive_index=1.5, shift=("none", "optimal", 0.5)[seed % 3], crosstalk=True
+    )
+    cones = lens.incidence(layout.centroid_um)
+    found = optics.footprints(layout, cones)
+    collected = found.response + np.asarray(found.mixing.sum(axis=0)).ravel()
+
+    assert collected.max() <= 1.0 + 1e-12
+    # Without gaps between photodiodes, nothing is lost inside of the field.
+    distance_um = np.abs(layout.centroid_um - 0.5 * (layout.centroid_um.min(axis=0) + layout.centroid_um.max(axis=0)))
+    is_inside = (distance_um < 0.25 * np.ptp(layout.centroid_um, axis=0)).all(axis=1)
+    assert collected[is_inside].min() >= 1.0 - 1e-9
+    alone = replace(optics, crosstalk=False).footprints(layout, cones).response
+    np.testing.assert_allclose(found.response, alone, atol=2e-3)
+
+
 @pytest.mark.parametrize("inset_um", [0.0, 0.5])
 def test_mixing_and_losses_are_all_light(inset_um):
     layout = fs.layout.hexagonal(n_columns=14, n_rows=14, pitch_um=3.0)
