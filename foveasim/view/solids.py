@@ -18,6 +18,8 @@ them, trimesh writes them.
 
 from __future__ import annotations
 
+import io
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -442,8 +444,8 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
     meshes : sequence of Mesh
     path : path
         ``.glb`` stores separate parts, with colours and the attributes ``_photosite`` and ``_value`` of every point; ``.3mf``
-        stores separate parts; ``.ply`` and ``.obj`` store colours; ``.stl`` stores triangles only. The unit is 1 µm; z points
-        toward the lens.
+        stores separate parts, and states micrometres; ``.ply`` and ``.obj`` store colours; ``.stl`` stores triangles only. The
+        unit is 1 µm; z points toward the lens.
 
     Raises
     ------
@@ -478,7 +480,20 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
     scene = trimesh.Scene(bodies) if kind in (".glb", ".3mf") else trimesh.util.concatenate(list(bodies.values()))
     with atomic_write(target) as temporary, temporary.open("wb") as file:
         content = scene.export(file_type=kind[1:])
-        file.write(content.encode() if isinstance(content, str) else content)
+        content = content.encode() if isinstance(content, str) else content
+        file.write(_in_micrometres(content) if kind == ".3mf" else content)
+
+
+def _in_micrometres(content: bytes) -> bytes:
+    """Return a 3MF file that states its unit; trimesh states millimetres."""
+    changed = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as source, zipfile.ZipFile(changed, "w", zipfile.ZIP_DEFLATED) as target:
+        for name in source.namelist():
+            part = source.read(name)
+            if name.endswith(".model"):
+                part = part.replace(b'unit="millimeter"', b'unit="micron"', 1)
+            target.writestr(name, part)
+    return changed.getvalue()
 
 
 def _near_quarter(layout: Layout, fractions: tuple[float, float]) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import zipfile
 
 import numpy as np
 import pytest
@@ -416,6 +417,10 @@ def test_other_files_preserve_faces_and_volume(model, extension, tmp_path):
 
     assert n_faces == sum(mesh.triangles.shape[0] for mesh in model.meshes)
     assert sum(body.volume for body in bodies) == pytest.approx(volume_um3, rel=1e-5)
+    if extension == ".3mf":  # opens at its true size, also in other programs
+        assert {body.units for body in bodies} <= {"micron", "microns", "um"}
+        with zipfile.ZipFile(tmp_path / "sensor.3mf") as archive:
+            assert b'unit="micron"' in archive.read("3D/3dmodel.model")
 
 
 def test_unknown_extension_raises_without_output(model, tmp_path):
