@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from difflib import SequenceMatcher
 from itertools import islice
 from pathlib import Path
+from string import ascii_uppercase
 
 from foveasim.errors import printable
+
+#: Key of a layout's provenance: letters of the colours of channels 0, 1, ...
+CHANNEL_LETTERS = "channel_letters"
+#: Letters of colours, and the first letters of the names of their filters: clear and panchromatic ones are white.
+COLOURS = {"R": "r", "G": "g", "B": "b", "W": "wcp", "C": "cwp", "Y": "y", "M": "m", "E": "e", "N": "ni", "I": "in"}
 
 #: Longest complete list of names in a message; of longer lists, it contains the closest names and the total number.
 MAX_LISTED = 16
@@ -145,3 +151,17 @@ def _similarity(name: object, other: str) -> float:
     if unit == other_unit and begin and other_begin and first != second:
         first, second = begin, other_begin
     return SequenceMatcher(None, second, first, autojunk=False).ratio()
+
+
+def find_wrong_letter(letters: str, channels: Iterable[int], names: Sequence[str]) -> int | None:
+    """
+    Return the first channel in use whose filter has another name than its letter, or None.
+
+    Filters that are only numbered have no names. The letters A, B, C, ... number as many filters, whatever their names.
+    """
+    if all(name.isdigit() for name in names) or letters == ascii_uppercase[: len(names)]:
+        return None
+    for k in channels:
+        if k < len(letters) and not names[k].lower().startswith(tuple(COLOURS.get(letters[k], letters[k].lower()))):
+            return k
+    return None

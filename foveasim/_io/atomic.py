@@ -51,7 +51,11 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_files(*targets: Path) -> Iterator[list[Path]]:
-    """Yield temporary paths that replace all targets if the block succeeds, else none: see :func:`atomic_write`."""
+    """
+    Yield temporary paths that replace all targets if the block succeeds, else none.
+
+    See :func:`atomic_write`.
+    """
     problem: FileError | None = None
     try:
         with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""Framing: the pitch and the optical axis of a scene with ``fit`` on the layouts of one or several cameras."""
+"""Framing: pitch and optical axis of a scene with ``fit``, for one or several cameras."""
 
 from __future__ import annotations
 
@@ -27,7 +27,11 @@ COVER_MARGIN = 1e-5
 
 
 def axis_of(bounds_um: Floats) -> Position:
-    """Return the optical axis of a framed scene without a lens model: the centre of the bounding box (4,) µm."""
+    """
+    Return the optical axis of a framed scene without a lens model, (x, y) µm.
+
+    It is the centre of the bounding box (4,) µm.
+    """
     centre_um = 0.5 * (bounds_um[:2] + bounds_um[2:])
     is_centred = np.abs(centre_um) <= CENTRE_ROUNDING * (bounds_um[2:] - bounds_um[:2])
     x_um, y_um = np.where(is_centred, 0.0, centre_um).tolist()
@@ -55,9 +59,9 @@ def common_bounds_um(cameras: Sequence[Camera], fit: str) -> Floats:
 
 def fit_scene(scene: Scene, optics: Optics, lens: Lens | None, bounds_um: Floats) -> Scene:
     """
-    Return a scene with the pitch and the optical axis of its framing on a field, with bounds (4,) µm.
+    Return a scene with the pitch and the optical axis of its framing on a field.
 
-    See :meth:`foveasim.Camera.frame`.
+    ``bounds_um``: of the field, (4,). See :meth:`foveasim.Camera.frame`.
     """
     fit, frame = scene.fit, SensorFrame.of(lens, axis_of(bounds_um))
     axis_um, range_um = np.array(frame.axis_um), np.array(scene.gaze_range_um)

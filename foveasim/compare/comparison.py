@@ -24,6 +24,7 @@ from foveasim.compare.information import scene_covariance
 from foveasim.compare.intervals import MedianInterval, median_interval
 from foveasim.compare.measure import (
     MEASURES,
+    Wave,
     best_cameras,
     information_by_annulus,
     layout_measures,
@@ -379,11 +380,11 @@ def cameras(
 
     annuli, grid, covariance_grid = _field(list(named.values()), fixation, n_annuli, max_pixels)
     shots: dict[str, list[_Shot]] = {name: [] for name in named}
-    photons, bands = [], []
+    photons, spectra = [], []
     for light in lights.values():
         maps: dict[tuple[float, float], PowerMap] = {}  # by the direction of cameras that turn
         photons.append(_photons_per_um2(_image(first.at((0.0, 0.0)), light, maps), covariance_grid, exposure_s))
-        bands.append(_band_irradiance(maps[0.0, 0.0], covariance_grid))
+        spectra.append(_mean_spectrum(maps[0.0, 0.0], covariance_grid))
         for name, camera in named.items():
             capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
             known = _with_angular_response(camera, light)
@@ -404,7 +405,7 @@ def cameras(
     ideals: dict[str, list[Picture]] = {}
     waves = sorted(
         {
-            (float(np.mean(light.wavelength_nm)), float(light.distance_m) if isinstance(light, Scene) else math.inf)
+            Wave(float(np.mean(light.wavelength_nm)), float(light.distance_m) if isinstance(light, Scene) else math.inf)
             for light in lights.values()
         }
     )
@@ -413,7 +414,7 @@ def cameras(
         qualities = [
             quality_by_eccentricity(one.picture, one.ideal, **annuli._asdict(), is_compared=is_common) for one in own
         ]
-        e_per_photon = _e_per_photon(camera.sensor, bands)
+        e_per_photon = _e_per_photon(camera.sensor, spectra)
         responses = [e_per_photon[camera.sensor.filter_of_site] * one.response for one in own]
         measures = [quality._asdict() | one.measures for quality, one in zip(qualities, own, strict=True)]
         found = (
@@ -474,7 +475,11 @@ def _with_angular_response(camera: Camera, light: Scene | PowerMap) -> Sensor:
 
 
 def _image(camera: Camera, light: Scene | PowerMap, maps: dict[tuple[float, float], PowerMap]) -> PowerMap:
-    """Return the ideal image that a camera sees, from ``maps`` if it contains that of its direction."""
+    """
+    Return the ideal image that a camera sees.
+
+    ``maps``: images by the direction of the camera, which are computed once.
+    """
     turned_um = camera.gaze_um if camera.axis == "sensor" else (0.0, 0.0)
     if turned_um not in maps:
         maps[turned_um] = camera.power_map(light) if isinstance(light, Scene) else light
@@ -487,21 +492,28 @@ def _photons_per_um2(image: PowerMap, grid: Grid, exposure_s: float) -> Floats:
     return np.asarray(reference(image, grid, weights=per_w_m2[np.newaxis]).data[0], np.float64)
 
 
-def _band_irradiance(image: PowerMap, grid: Grid) -> tuple[Floats, Floats]:
-    """Return the wavelengths of an image, and the mean irradiance of each band in a field, or in all of it without a part."""
+class _Spectrum(NamedTuple):
+    """Mean irradiance of each band of an image, W/m²."""
+
+    wavelength_nm: Floats
+    irradiance_w_m2: Floats
+
+
+def _mean_spectrum(image: PowerMap, grid: Grid) -> _Spectrum:
+    """Return the mean spectrum of an image in a field; in all of it if it has no part there."""
     x0_um, y0_um, x1_um, y1_um = grid.bounds_um
     is_x, is_y = (
         (low <= at) & (at <= high)
         for low, at, high in ((x0_um, image.grid.x_um, x1_um), (y0_um, image.grid.y_um, y1_um))
     )
     cells = image.data[:, is_y][:, :, is_x] if is_x.any() and is_y.any() else image.data
-    return image.wavelength_nm, cells.mean(axis=(1, 2), dtype=np.float64)
+    return _Spectrum(image.wavelength_nm, cells.mean(axis=(1, 2), dtype=np.float64))
 
 
-def _e_per_photon(sensor: Sensor, bands: Sequence[tuple[Floats, Floats]]) -> Floats:
-    """Return the electrons of each filter per photon of the mean spectrum of several images."""
-    electrons = sum(sensor.responsivity_e_per_j(wavelength_nm) @ power for wavelength_nm, power in bands)
-    n_photons = sum(float((power / photon_energy_j(wavelength_nm)).sum()) for wavelength_nm, power in bands)
+def _e_per_photon(sensor: Sensor, spectra: Sequence[_Spectrum]) -> Floats:
+    """Return the electrons of each filter per photon of the sum of spectra."""
+    electrons = sum(sensor.responsivity_e_per_j(one.wavelength_nm) @ one.irradiance_w_m2 for one in spectra)
+    n_photons = sum(float((one.irradiance_w_m2 / photon_energy_j(one.wavelength_nm)).sum()) for one in spectra)
     return np.asarray(electrons / n_photons, np.float64)
 
 
@@ -515,7 +527,7 @@ def _behind_image(camera: Camera) -> Camera:
 
 
 class _Shot(NamedTuple):
-    """Picture, ideal picture, model, response to light and measures of the capture of a scene by a camera."""
+    """What a comparison keeps of the capture of a scene by a camera."""
 
     picture: Picture
     ideal: Picture
@@ -527,7 +539,7 @@ class _Shot(NamedTuple):
 def _field(
     cameras: Sequence[Camera], centre_um: tuple[float, float], n_annuli: int, max_pixels: int
 ) -> tuple[Annuli, Grid, Grid]:
-    """Return the annuli and the picture grid of the common field, and the grid in the image for covariances."""
+    """Return annuli and picture grid of the common field, and the image grid for covariances."""
     all_layouts = [camera.layout for camera in cameras]
     bounds_um = np.array([layout.bounds_um for layout in all_layouts])
     low, high = bounds_um[:, :2].min(axis=0), bounds_um[:, 2:].max(axis=0)

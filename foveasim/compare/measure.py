@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ from foveasim.units import per_mm_from_per_um
 __all__ = [
     "MEASURES",
     "Measure",
+    "Wave",
     "information_by_annulus",
     "layout_measures",
     "measure_rows",
@@ -54,6 +55,13 @@ SHIFT_CELLS, MAX_UNCOVERED_FRACTION = 0.05, 1e-9
 ROUNDING = 1e-12
 #: Level of MTF50.
 HALF = 0.5
+
+
+class Wave(NamedTuple):
+    """Mean wavelength and distance of a scene, for the MTF of a lens."""
+
+    wavelength_nm: float
+    distance_m: float
 
 
 @dataclass(frozen=True)
@@ -105,13 +113,11 @@ MEASURES = {
 }  # fmt: skip
 
 
-def layout_measures(
-    camera: Camera, waves: Sequence[tuple[float, float]], annuli: Annuli, wave_per_mm: float
-) -> dict[str, Any]:
+def layout_measures(camera: Camera, waves: Sequence[Wave], annuli: Annuli, wave_per_mm: float) -> dict[str, Any]:
     """
     Return the measures that do not depend on a scene, in total and by annulus.
 
-    ``waves``: wavelengths in nm and distances in m of the scenes. The MTF of the lens is their mean.
+    ``waves``: those of the scenes. The MTF of the lens is their mean.
     """
     layout = camera.layout
     annulus = annuli.index_of(layout.centroid_um)
@@ -123,7 +129,9 @@ def layout_measures(
 
     def lens_mtf(per_mm: Floats) -> Floats:
         return np.asarray(
-            np.mean([camera.optics.mtf(per_mm, wave_nm, distance_m=at_m) for wave_nm, at_m in waves], axis=0)
+            np.mean(
+                [camera.optics.mtf(per_mm, wave.wavelength_nm, distance_m=wave.distance_m) for wave in waves], axis=0
+            )
         )
 
     lens = lens_mtf(frequency)

@@ -137,7 +137,7 @@ def _scenes(shots: dict[str, Shot], paths: Sequence[Path]) -> dict[str, Scene | 
 
 
 def _photographs(shots: dict[str, Shot], pictures: Sequence[str | Path]) -> dict[str, Scene]:
-    """Return photographs with the distance, radiance and bands of the scenes of all shots, which must be equal."""
+    """Return photographs with the distance, radiance and bands of all shots, which are equal."""
     light: dict[str, dict[str, Any]] = {}
     for name, shot in shots.items():
         scene = shot.scene

@@ -142,7 +142,7 @@ def search_value(
         if value not in results:
             try:
                 result = float(result_at(value))
-                # No signal, or saturation: a jump to 0 is no crossing of a limit, and the largest results are next to it.
+                # No signal, or saturation: a jump to 0 does not cross a limit, and the largest results are next to it.
                 results[value] = math.nan if result == 0.0 and requirement.measure == "snr" else result
             except FoveasimError as error:  # such as a generator without sites: the other values may be valid
                 problems.append(str(error))

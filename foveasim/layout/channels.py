@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import NOT_NEGATIVE, Limits
-from foveasim._core.channel_letters import CHANNEL_LETTERS, COLOURS
-from foveasim._core.names import did_you_mean, list_names
+from foveasim._core.names import CHANNEL_LETTERS, COLOURS, did_you_mean, list_names
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Ints, finite_array, freeze
 from foveasim.errors import ParameterError

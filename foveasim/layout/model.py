@@ -13,8 +13,7 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FINITE, POSITIVE, OwnCheck
-from foveasim._core.channel_letters import CHANNEL_LETTERS
-from foveasim._core.names import possible_names
+from foveasim._core.names import CHANNEL_LETTERS, possible_names
 from foveasim._core.provenance import copy_plain_data
 from foveasim._core.rings import (
     are_convex,

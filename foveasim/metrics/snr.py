@@ -77,9 +77,9 @@ class SnrTable:
     @property
     def snr(self) -> Floats:
         """
-        Signal over noise, (n_class,), of which saturated sites contribute 0: times the fraction of the others.
+        Signal over noise times the fraction of unsaturated sites, (n_class,).
 
-        It is at most the square root of the signal in electrons.
+        Saturated sites contribute 0. It is at most the square root of the signal in electrons.
         """
         ratio = np.divide(self.signal_dn, self.noise_dn, out=np.zeros_like(self.signal_dn), where=self.noise_dn > 0.0)
         return (1.0 - self.saturated_fraction) * ratio
@@ -425,7 +425,11 @@ def _sensor_and_layout(camera: Camera) -> tuple[Sensor, Layout]:
 
 
 def _full_well_e(settings: Mapping[str, Any] | None, full_well_e: ArrayLike | None, n_sites: int) -> Floats | None:
-    """Return the full well capacity, one or (n_site,); None if unlimited or without the settings of captures."""
+    """
+    Return the full well capacity, one or (n_site,).
+
+    None if it is unlimited, or without the settings of captures.
+    """
     if full_well_e is None:
         if settings is None:
             return None

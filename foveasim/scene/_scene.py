@@ -283,7 +283,7 @@ class Scene:
         )
 
     def framed(self, pitch_um: float, axis_um: tuple[float, float] | None) -> Scene:
-        """Return a scene with ``fit`` with the pitch and the optical axis that it requires; ``fit`` remains."""
+        """Return a scene with ``fit`` with its pitch and its optical axis."""
         return self._with(pitch_um=PITCH.check("pitch_um", pitch_um), axis_um=axis_um)
 
     def with_centre(self, centre_um: tuple[float, float]) -> Scene:

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Limits, OwnCheck, Usual, check_declared, declarations_of
-from foveasim._core.channel_letters import CHANNEL_LETTERS, find_wrong_letter
-from foveasim._core.names import possible_names
+from foveasim._core.names import CHANNEL_LETTERS, find_wrong_letter, possible_names
 from foveasim._core.provenance import is_digest, large_arrays, resolve
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn

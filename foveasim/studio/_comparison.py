@@ -88,7 +88,7 @@ def _frame_rate(result: Simulated) -> float | None:
 
 
 def _framed_together(results: Sequence[Simulated]) -> list[tuple[Scene | PowerMap, Capture]]:
-    """Return the scene and the capture of each variant, with scenes with ``fit`` framed on all layouts."""
+    """Return scene and capture of each variant, framed on all layouts with ``fit``."""
     shots = [result.shot for result in results]
     cameras = [shot.camera for shot in shots]
     own = [(shot.scene, result.capture) for shot, result in zip(shots, results, strict=True)]

@@ -245,7 +245,7 @@ def test_settings_in_messages_are_short(foveasim, tmp_path):
         (("video", "picture.yaml", "--frames", "frames", "--stop", "9" * 30), "error: 'stop' must be <= "),
         (("dataset", "dataset.yaml"), "error: dataset.yaml:1:1: 'cameras' must be <= 1000000000"),
         (("study", "study.yaml"), "error: study.yaml:4:3: "),
-        (("check", "x" * 5000), "File name too long"),
+        (("check", "x" * 5000), "must have names of at most 255 bytes"),
     ],
     ids=lambda value: " ".join(value)[:30] if isinstance(value, tuple) else None,
 )

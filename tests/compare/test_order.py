@@ -36,7 +36,7 @@ CAMERAS = {
         {
             "wide": camera_of(fs.layout.grid(n_x=24, n_y=10, pitch_um=2.0)),
             "high": camera_of(fs.layout.grid(n_x=12, n_y=20, pitch_um=2.0)),
-            "beside": camera_of(fs.layout.grid(n_x=16, n_y=15, pitch_um=2.0).translate(5.0, -3.0)),
+            "moved": camera_of(fs.layout.grid(n_x=16, n_y=15, pitch_um=2.0).translate(5.0, -3.0)),
         },
         {"covers": {"fit": "cover"}, "within": {"fit": "contain"}},
     ),

@@ -321,7 +321,7 @@ def _accepts_path(value: Any) -> bool:
 
 
 def _is_too_long(value: Any) -> bool:
-    """Whether a path has a name that file systems reject, for which pathlib raises an OSError of its own."""
+    """Whether file systems reject a path, for which pathlib raises an OSError."""
     path = os.fspath(value)
     if len(path) <= MAX_NAME_BYTES // 4:  # the common case: of at most 4 bytes per character
         return False

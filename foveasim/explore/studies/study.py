@@ -378,7 +378,11 @@ def _prepare(
 
 
 def _sample_rest(optuna: Any, optuna_study: optuna.Study, trial: optuna.Trial, plan: StudyPlan, n: int) -> None:
-    """Sample the settings of trial n that an interruption left without a value, as a copy of the study samples all of them."""
+    """
+    Sample the settings of trial n that an interruption left without a value.
+
+    A copy of the study samples all of them, with the seed of the trial.
+    """
     copy = optuna.create_study(directions=optuna_study.directions)
     # Those of the batch without results, too: the sampler avoids their settings.
     copy.add_trials([each for each in optuna_study.get_trials(deepcopy=False) if each.number != trial.number])

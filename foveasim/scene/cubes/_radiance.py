@@ -175,7 +175,7 @@ def _parse(text: str, bands_nm: Floats) -> tuple[Quantity | None, Floats, str]:
 def _illumination(
     waves_nm: Floats, illuminant: Illuminant | IlluminantTable | None
 ) -> tuple[Floats, tuple[float, float]]:
-    """Return the relative spectrum of a white of reflectance 1, (n_wavelength,), and the range in which it is known, nm."""
+    """Return the relative spectrum of white, (n_wavelength,), and the range of its table, nm."""
     if isinstance(illuminant, Mapping):
         return _table(illuminant, waves_nm)
     try:

@@ -173,7 +173,7 @@ class Microlens(PixelOptics):
 
     def _with_crosstalk(self, sites: Photosites, incidence: Incidence, layers: Layers, response: Floats) -> Footprints:
         """
-        Return the fractions of the light of sites on their own photodiodes and on those of others.
+        Return the fractions of the light of sites on all photodiodes.
 
         Both are parts of the same image, without interpolation, so that their sum is at most 1.
         """
