@@ -527,7 +527,7 @@ def _behind_image(camera: Camera) -> Camera:
 
 
 class _Shot(NamedTuple):
-    """What a comparison keeps of the capture of a scene by a camera."""
+    """Parts of a capture of a scene that a comparison keeps."""
 
     picture: Picture
     ideal: Picture

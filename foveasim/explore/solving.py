@@ -168,6 +168,8 @@ def search_value(
             f"{requirement} cannot be reached with {setting} from {low:g} to {high:g}: results are from {min(known):.4g} to "
             f"{max(known):.4g}{unit}"
         )
+    # The nearest result to a limit is that of a step, or next to a jump: at saturation, a ratio falls to 0.
+    met = [value for value in met if target.is_met(results[value])] or met
     found = min(met, key=lambda value: (abs(_position(value, low, high) - _position(start, low, high)), value))
     return Solution(setting, found, results[found], sorted(results.items()))
 

@@ -345,6 +345,14 @@ def test_all_measures_have_words():
     assert fs.config.Requirement is Requirement
 
 
+def test_exact_solution_is_preferred_to_jump():
+    """As a ratio that falls where sites saturate: the jump at 4 is nearer to the start than the solution."""
+    found = search_value("x", 8.0, between(10.0, 10.0), lambda x: 20.0 * x if x < 4.0 else 7.0, bounds=(0.1, 9.0))
+
+    assert found.value == pytest.approx(0.5, rel=2e-3)
+    assert found.result == pytest.approx(10.0, rel=1e-3)
+
+
 @pytest.mark.parametrize("setting", ["optics.f_number", "exposure_s"])
 def test_numbers_of_files_are_continuous(setting):
     """A value such as 4 in a file does not restrict the solution."""

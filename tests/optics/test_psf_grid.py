@@ -759,7 +759,6 @@ def test_index_does_not_leave_its_directory(tmp_path, name):
     folder = tmp_path / "lens"
     (folder / "sub").mkdir(parents=True)
     index_of(tmp_path, ENTRIES[:1])
-    messages = []
     for stem in ("a", "missing"):
         (folder / f"link_{stem}.txt").symlink_to(tmp_path / f"{stem}.txt")
         file = name.format(stem, folder=tmp_path)
@@ -769,10 +768,9 @@ def test_index_does_not_leave_its_directory(tmp_path, name):
             FileError, match="outside its directory; move the file, or pass allow_outside=True"
         ) as caught:
             read_psfs(index)
-        messages.append(str(caught.value).replace(file, ""))
+        assert "exist" not in str(caught.value)
         if stem == "a":
             assert read_psfs(index, allow_outside=True).wavelength_nm.tolist() == [500.0]
-    assert messages[0] == messages[1]
     shot = fs.config.read_settings(fs.config.demo_settings()[0])
     shot["optics"]["psfs"] = {"path": str(index), "allow_outside": True}
     with pytest.raises(fs.errors.ConfigError, match=r"optics\.psfs\.allow_outside: unknown"):
