@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from dataclasses import replace
 
@@ -371,3 +372,17 @@ def test_scene_with_fit_is_drawn_in_pixels():
 
     assert (ax.get_xlabel(), ax.get_xlim(), ax.get_ylim()) == ("x / pixels", (-20.0, 20.0), (-15.0, 15.0))
     assert "fit='cover'" in scene._repr_html_().replace("&#x27;", "'")
+
+
+def test_optical_axis_stays_with_framed_scene():
+    """A part, a copy in another process and a displacement keep the axis that several cameras have in common."""
+    centred, aside = (camera_of(fs.layout.grid(n_x=20, n_y=10, pitch_um=1.0).translate(x, 0.0)) for x in (0.0, 30.0))
+    framed = centred.frame(scene_of(fit="cover"), others=[aside])
+    part = replace(framed, basis=framed.basis[:, 1:-1, 1:-1])
+
+    assert framed.axis_um == (15.0, 0.0)
+    for scene in (framed, part, pickle.loads(pickle.dumps(framed)), framed.with_centre((5.0, 0.0))):
+        assert [camera.sensor_frame(scene).axis_um for camera in (centred, aside)] == [(15.0, 0.0)] * 2
+    assert framed.with_pitch(3.0).axis_um is None
+    with pytest.raises(ParameterError, match="'axis_um' requires 'fit'"):
+        replace(framed, fit=None)

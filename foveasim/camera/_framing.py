@@ -38,6 +38,15 @@ def axis_of(bounds_um: Floats) -> Position:
     return x_um, y_um
 
 
+def different_part(one: Camera, other: Camera) -> str:
+    """Return in what two cameras differ, ``"optics"`` or ``"distortion"``; empty for nothing."""
+    for part in ("optics", "distortion"):
+        own, others = getattr(one, part), getattr(other, part)
+        if own is not others and to_plain_data(own) != to_plain_data(others):
+            return part
+    return ""
+
+
 def common_bounds_um(cameras: Sequence[Camera], fit: str) -> Floats:
     """
     Return the bounds of the undistorted outlines of all cameras, (4,) µm.
@@ -45,9 +54,8 @@ def common_bounds_um(cameras: Sequence[Camera], fit: str) -> Floats:
     Raises ParameterError when lenses differ, or when no camera has photosites in the image circle.
     """
     first, *others = cameras
-    for part in ("optics", "distortion") if others else ():
-        own = to_plain_data(getattr(first, part))
-        if any(to_plain_data(getattr(camera, part)) != own for camera in others):
+    for camera in others:
+        if part := different_part(first, camera):
             raise ParameterError("others", f"must be cameras with the same {part}")
     bounds_um = np.array([camera.layout_bounds_um for camera in cameras])
     known_um = bounds_um[~np.isnan(bounds_um).any(axis=1)]

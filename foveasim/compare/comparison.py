@@ -18,6 +18,7 @@ from foveasim._core.extras import import_optional
 from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.validation import Floats, check_choice, check_number, finite_array, read_only
 from foveasim.camera import Camera
+from foveasim.camera._framing import different_part
 from foveasim.compare.annuli import Annuli, quality_by_eccentricity
 from foveasim.compare.budgets import BUDGETS, Budget, budget_of, budget_rows, check_equal_budgets
 from foveasim.compare.information import scene_covariance
@@ -615,9 +616,8 @@ def _check_cameras(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
     (first_name, first), *others = named.items()
     for name, camera in others:
         pair = f"{format_value(first_name)} and {format_value(name)}"
-        for part in ("optics", "distortion"):
-            if to_plain_data(getattr(camera, part)) != to_plain_data(getattr(first, part)):
-                raise ParameterError("cameras", f"must have the same {part}: those of {pair} differ")
+        if part := different_part(first, camera):
+            raise ParameterError("cameras", f"must have the same {part}: those of {pair} differ")
         if camera.sensor.filter_names != first.sensor.filter_names:
             raise ParameterError("cameras", f"must have the same colour filters: those of {pair} differ")
     return named

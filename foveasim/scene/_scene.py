@@ -135,6 +135,8 @@ class Scene:
     is_rgb : bool
         Whether the three basis images are the channels of a photograph in linear sRGB, which the colour correction of captures
         reproduces.
+    axis_um : (x, y), optional, µm
+        With ``fit``, where the optical axis meets the sensor; :meth:`foveasim.Camera.frame` sets it together with the pitch.
 
     Raises
     ------
@@ -173,9 +175,7 @@ class Scene:
     centre_um: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
     illuminant: Floats | None = field(default=None, kw_only=True)
     is_rgb: bool = field(default=False, kw_only=True)
-
-    #: Where the optical axis of a framed scene meets the sensor, (x, y) µm: :meth:`framed`.
-    axis_um: ClassVar[tuple[float, float] | None] = None
+    axis_um: tuple[float, float] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         check_declared(self)
@@ -226,6 +226,10 @@ class Scene:
         object.__setattr__(self, "gaze_range_um", check_point("gaze_range_um", self.gaze_range_um, at_least=0.0))
         if any(self.centre_um) and self.fit is not None:
             raise _framing_conflict("fit", self.fit, "centre_um")
+        if self.axis_um is not None:
+            if self.fit is None:
+                raise ParameterError("axis_um", "requires 'fit'", self.axis_um, "µm")
+            object.__setattr__(self, "axis_um", check_point("axis_um", self.axis_um))
         if any(self.gaze_range_um) and self.fit != "cover":
             raise ParameterError("gaze_range_um", "requires fit='cover'", self.gaze_range_um, "µm")
 
