@@ -297,6 +297,15 @@ def parse_channel(name: str, value: Any, filter_names: Sequence[str]) -> int:
     return check_count(name, value, at_least=0, at_most=MAX_LAYER)
 
 
+def are_colours(channels: Any, layers: Sequence[DrawnLayer], filter_names: Sequence[str] | None) -> bool:
+    """Whether filter layers are selected by the default letters of colours."""
+    named = [
+        *(channels or {}).values(),
+        *(layer.name.removeprefix(FILTER) for layer in layers if layer.channel is not None),
+    ]
+    return filter_names is None and any(name in FILTER_NAMES for name in named)
+
+
 def check_filter_names(filter_names: Sequence[str] | None) -> Sequence[str]:
     """Return the names of the channels, by default R, G, B, W."""
     if filter_names is None:

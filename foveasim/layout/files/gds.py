@@ -41,6 +41,7 @@ import shapely
 from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
+from foveasim._core.names import CHANNEL_LETTERS
 from foveasim._core.rings import SITE_ID, positions_in_runs, site_ids
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import MAX_SITES, Floats, Ints
@@ -69,10 +70,12 @@ from foveasim.layout.files._derived import shapes_of_layout, shapes_of_sites
 from foveasim.layout.files._hierarchy import Arrays, concatenate, congruence_classes, find_arrays, single_sites
 from foveasim.layout.files._holes import hole_free_rings, without_keyholes
 from foveasim.layout.files._layers import (
+    FILTER_NAMES,
     MAX_LAYER,
     PHOTOSITE,
     DrawnLayer,
     LayerNumber,
+    are_colours,
     parse_channels,
     parse_layer,
     parse_layer_map,
@@ -607,7 +610,7 @@ def read(
     of them, or are skipped or repaired with a warning.
     """
     import_optional(path, "gdstk")
-    wanted, filters = _selection(layer, layers, channels, filter_names)
+    wanted, filters, have_colours = _selection(layer, layers, channels, filter_names)
     with as_file_error(path, "GDSII or OASIS layout"):
         data = path.read_bytes()
         is_oasis = data.startswith(OASIS_MAGIC)
@@ -647,22 +650,28 @@ def read(
             equal = np.stack((site[is_filter], number[is_filter]))
             covers_um = _to_um(covers.xy, answer["dbu_um"])
             channel = _covering_channels(path, layout, equal, covers_um, covers, filters)
-            layout = layout.with_columns(channel=channel).with_provenance(about)
+            colours = {CHANNEL_LETTERS: "".join(FILTER_NAMES)} if have_colours else {}
+            layout = layout.with_columns(channel=channel).with_provenance(about | colours)
         return layout
 
 
 def _selection(
     layer: Any, layers: Any, channels: Any, filter_names: Sequence[str] | None
-) -> tuple[list[LayerNumber] | None, dict[LayerNumber, int]]:
-    """Return the layers of the photosites (None: default), and the channels of filters."""
+) -> tuple[list[LayerNumber] | None, dict[LayerNumber, int], bool]:
+    """
+    Return the layers of the photosites (None: default), and the channels of filters.
+
+    The last value is whether they are named by colours.
+    """
     wanted = None if layer is None else parse_selection(layer)
     filters = {} if channels is None else parse_channels(channels, filter_names)
+    drawn: list[DrawnLayer] = []
     if layers is not None:
         drawn = parse_layer_map(layers, filter_names)
         if wanted is None:
             wanted = [d.number for d in drawn if d.name == PHOTOSITE]
         filters = {d.number: d.channel for d in drawn if d.channel is not None} | filters
-    return wanted, filters
+    return wanted, filters, are_colours(channels, drawn, filter_names)
 
 
 def _with_channel(

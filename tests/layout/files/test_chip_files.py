@@ -467,6 +467,25 @@ def test_filters_with_equal_outlines_conflict(tmp_path, layer):
             fs.read_layout(tmp_path / "a.gds", layer=1, channels=channels)
 
 
+def test_letters_of_filter_layers_are_checked(tmp_path):
+    library = gdstk.Library()
+    cell = library.new_cell("A")
+    for k, layer in enumerate((2, 3, 4)):
+        cell.add(*(gdstk.rectangle((2 * k, 0), (2 * k + 2, 2), number) for number in (1, layer)))
+    library.write_gds(tmp_path / "a.gds")
+    path, letters = tmp_path / "a.gds", {2: "R", 3: "G", 4: "B"}
+    maps = ({"channels": letters}, {"layers": {"photosite": 1, "filter_R": 2, "filter_G": 3, "filter_B": 4}})
+    curves = [fs.sensor.ConstantCurve(0.5)] * 3
+    exchanged = fs.FilterSet(curves, ("blue", "green", "red"))
+    for options in maps:
+        layout = fs.read_layout(path, layer=1, **options)
+        assert fs.Sensor(layout, filters="rgb").n_filters == 3
+        with pytest.raises(fs.errors.SimulationError, match="filter 0 of the sensor is 'blue', not of the colour 'R'"):
+            fs.Sensor(layout, filters=exchanged)
+    for options in ({"channels": {2: 0, 3: 1, 4: 2}}, {"channels": letters, "filter_names": ("R", "G", "B")}):
+        fs.Sensor(fs.read_layout(path, layer=1, **options), filters=exchanged)  # in the order of the caller
+
+
 def test_site_without_filter_is_reported(foreign):
     with pytest.raises(FileError, match=r"has \d+ of 360 photosites without a filter, first site \d+ at"):
         fs.read_layout(foreign, cell="SENSOR", layer=(77, 3), channels={(10, 0): "R", (11, 2): "G"})
