@@ -150,6 +150,11 @@ def test_interrupted_study_resumes_identically(tmp_path):
     assert len(again.trials) == 14
     assert outcomes(run(14, storage=f"sqlite:///{tmp_path}/study.db")) == outcomes(complete)
     assert outcomes(run(14, seed=6)) != outcomes(complete)
+    several = run(11, storage=tmp_path / "several.db")
+    for _ in range(2):
+        several.ask()  # more trials than a batch: another program left them
+    values = [outcome[1:] for outcome in outcomes(run(14, storage=tmp_path / "several.db"))]
+    assert values == [outcome[1:] for outcome in outcomes(complete)]
 
 
 def batches(**options):

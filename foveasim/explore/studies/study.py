@@ -372,9 +372,13 @@ def _prepare(
     running = optuna_study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,))
     trials = [optuna.trial.Trial(optuna_study, trial._trial_id) for trial in running]  # noqa: SLF001 -- Optuna has no public way
     n_done = len(completed_trials(optuna_study))
-    if trials and n_done % plan.batch == 0:
-        _sample_rest(optuna, optuna_study, trials[-1], plan, n_done + len(trials) - 1)
-    return trials
+    n_left = plan.batch - n_done % plan.batch
+    for trial in trials[n_left:]:
+        _discard(optuna, trial)
+    for k, trial in enumerate(trials[:n_left]):
+        if len(trial.params) < len(plan.search):
+            _sample_rest(optuna, optuna_study, trial, plan, n_done + k)
+    return trials[:n_left]
 
 
 def _sample_rest(optuna: Any, optuna_study: optuna.Study, trial: optuna.Trial, plan: StudyPlan, n: int) -> None:
@@ -384,8 +388,8 @@ def _sample_rest(optuna: Any, optuna_study: optuna.Study, trial: optuna.Trial, p
     A copy of the study samples all of them, with the seed of the trial.
     """
     copy = optuna.create_study(directions=optuna_study.directions)
-    # Those of the batch without results, too: the sampler avoids their settings.
-    copy.add_trials([each for each in optuna_study.get_trials(deepcopy=False) if each.number != trial.number])
+    # Those of the batch without results, too: the sampler takes their settings into account.
+    copy.add_trials([each for each in optuna_study.get_trials(deepcopy=False) if each.number < trial.number])
     params = _ask(optuna, copy, plan, n).params
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
