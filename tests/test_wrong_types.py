@@ -223,6 +223,7 @@ def test_wrong_types_give_errors_of_package(tmp_path, monkeypatch):
         (lambda: fs.modes.write_events([], 1), "'path' must be a path, got 1"),
         (lambda: fs.read_layout("é" * 128), f"'path' {TOO_LONG} '{'é' * 60}...'"),
         (lambda: fs.read_layout("é" * 127), f"{'é' * 127}: no such file"),
+        (lambda: fs.read_layout("\ud800" * 80), "\\ud800\\ud800\\ud800"),
         (lambda: fs.Capture.load(Path("a" * 256) / "b.npz"), f"'path' {TOO_LONG} '{'a' * 60}...'"),
         (lambda: fs.config.read_settings("a/" * 3000), f"'path' {TOO_LONG} '{'a/' * 30}...'"),
         (lambda: fs.Sensor(fs.layout.grid(2, 2, 2.0)).pattern([]), "'name' must be a string, got []"),

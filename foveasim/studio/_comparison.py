@@ -82,8 +82,8 @@ def compare(variants: Sequence[tuple[str, Simulated]]) -> dict[str, Any]:
 def _frame_rate(result: Simulated) -> float | None:
     """Return the frame rate of a variant's readout, or of its exposures; None without both."""
     readout = None if result.shot.rules is None else result.shot.rules.readout
-    if readout is not None and readout.frames_per_s is not None:
-        return float(readout.frames_per_s)
+    if readout is not None:
+        return readout.frames_per_s
     return 1.0 / result.shot.exposure_s if result.shot.exposure_s > 0.0 else None
 
 
@@ -103,10 +103,10 @@ def _framed_together(results: Sequence[Simulated]) -> list[tuple[Scene | PowerMa
         except ParameterError:  # other lenses
             return own
         is_same = (framed.pitch_um, framed.axis_um) == (alone.pitch_um, alone.axis_um)
-        if is_same:
-            found.append((framed, result.capture))
-        else:
-            found.append((framed, shot.camera.capture(framed, exposure_s=shot.exposure_s, seed=shot.seed)))
+        capture = shot.camera.capture
+        found.append(
+            (framed, result.capture if is_same else capture(framed, exposure_s=shot.exposure_s, seed=shot.seed))
+        )
     return found
 
 

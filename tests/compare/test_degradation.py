@@ -17,7 +17,7 @@ from foveasim.explore import METRICS
 OPTICS = fs.Optics(focal_length_mm=8.0, f_number=2.8)
 LAYOUT = fs.layout.grid(n_x=24, n_y=24, pitch_um=2.0)
 GOOD_S = 0.02
-#: Exposures at which 0, 9, 39 and 97 % of the sites are saturated, and fractions of dead sites.
+#: Exposures from none to nearly all sites saturated, and fractions of dead sites.
 EXPOSURES_S, DEAD_FRACTIONS = (GOOD_S, 0.2, 0.4, 2.0), (0.0, 0.2, 0.6)
 
 
@@ -72,9 +72,8 @@ def test_saturated_sites_improve_no_result():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("exposure_s", EXPOSURES_S[:1])
-def test_dead_sites_improve_no_result(exposure_s):
-    found = [qualities(fraction, exposure_s)[0] for fraction in DEAD_FRACTIONS]
+def test_dead_sites_improve_no_result():
+    found = [qualities(fraction, GOOD_S)[0] for fraction in DEAD_FRACTIONS]
 
     for fewer, more in pairwise(found):
         for name, value in more.items():

@@ -433,6 +433,12 @@ def test_photons_are_independent_of_band_width(illuminant, step_nm):
     assert photons(step_nm) == pytest.approx(photons(1.0), rel=3e-4)
 
 
+@pytest.mark.parametrize("waves_nm", [[370.0, 500.0], [500.0, 790.0]])
+def test_wavelengths_outside_tables_are_named(waves_nm):
+    with pytest.raises(ParameterError, match="'wavelength_nm' must be from 380 to 780, the range of the tables"):
+        colours(wavelength_nm=waves_nm)
+
+
 def test_few_wavelengths_are_exact():
     waves_nm = [620.0, 550.0, 455.0]
     scene = colours(wavelength_nm=waves_nm, radiance_w_m2_sr_nm=0.3, illuminant="D65")

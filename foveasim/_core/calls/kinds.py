@@ -323,10 +323,10 @@ def _accepts_path(value: Any) -> bool:
 def _is_too_long(value: Any) -> bool:
     """Whether file systems reject a path, for which pathlib raises an OSError."""
     path = os.fspath(value)
-    if len(path) <= MAX_NAME_BYTES // 4:  # the common case: of at most 4 bytes per character
+    if len(path) <= MAX_NAME_BYTES // 4:  # the common case; a character has at most 4 bytes
         return False
-    name = os.fsencode(path)
-    return len(name) > MAX_PATH_BYTES or any(len(part) > MAX_NAME_BYTES for part in name.split(os.fsencode(os.sep)))
+    encoded = path if isinstance(path, bytes) else path.encode("utf-8", "surrogatepass")
+    return len(encoded) > MAX_PATH_BYTES or any(len(part) > MAX_NAME_BYTES for part in encoded.split(os.sep.encode()))
 
 
 def _accepts_number(value: Any) -> bool:

@@ -159,16 +159,15 @@ def colour_chart(
     >>> scene.basis.shape, scene.wavelength_nm.size
     ((12, 90, 120), 31)
     """
+    waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
+    illumination = cie_illuminant(illuminant, waves_nm)
+    weights, spectra = _patch_spectra(waves_nm, n_basis)  # before the bands: wavelengths are within the tables
     if raster.get("band_width_nm") is None:
-        waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
         raster["band_width_nm"] = band_widths_nm(waves_nm, None, TABLES_NM).tolist()
     canvas = Canvas(radiance_w_m2_sr_nm=1.0, wavelength_nm=wavelength_nm, **raster)
     step_mm = patch_mm + gap_mm
     canvas.check_fits("patch_mm", N_COLUMNS * step_mm - gap_mm, N_ROWS * step_mm - gap_mm)
     canvas.warn_if_fine("patch_mm", 2.0 * patch_mm)
-    weights, spectra = _patch_spectra(np.asarray(canvas.wavelength_nm), n_basis)
-    waves_nm = np.asarray(canvas.wavelength_nm)
-    illumination = cie_illuminant(illuminant, waves_nm)
     level = level_of_white(
         "radiance_w_m2_sr_nm",
         radiance_w_m2_sr_nm,
