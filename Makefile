@@ -10,7 +10,8 @@ INSTALL := -m pip install --quiet --no-compile
 PYTEST_ARGS ?=
 # Bytecode is stored next to the sources, even where the environment disables it: each process would compile the package and its tests.
 unexport PYTHONDONTWRITEBYTECODE
-PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
+# Processes take half of each other's remaining tests: they finish at the same time, and most files run in one process.
+PARALLEL := --numprocesses auto --maxprocesses 4 --dist worksteal
 
 # Lower bounds of pyproject.toml on the oldest Python: .venv-lowest/uv resolves them, .venv-lowest/env contains them.
 LOWEST := .venv-lowest
