@@ -45,7 +45,7 @@ POSITION_SD_UM = 3.0
 #: Photoelectrons per area at the irradiance of a digit, irradiance of the background, and read noise per site.
 ELECTRONS_PER_UM2, BACKGROUND, READ_NOISE_E = 100.0, 0.1, 5.0
 #: Design rules, weight of their barrier, and learning rates of the layout and of the network.
-RULES = fs.DesignRules(min_size_um=2.0, min_width_um=0.8, min_angle_deg=15.0)
+RULES = fs.DesignRules(min_size_um=2.0, min_width_um=0.8, min_angle_deg=15.0, angle_limit_deg=26.0)
 BARRIER, LAYOUT_RATE_UM, NETWORK_RATE = 3e-4, 0.2, 5e-3
 N_BATCH, N_HIDDEN, N_TEST = 128, 128, 4096
 #: Linear magnification in the centre of the warp by hand, and exponent of its growth: the best of seven pairs.

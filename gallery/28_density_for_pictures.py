@@ -40,7 +40,7 @@ EXPONENTS = (0.25, 0.5, 0.75, 1.0)
 #: Initial displacements, and learning rate of the coordinates.
 JITTER_UM, LEARNING_RATE_UM = 0.3, 0.05
 #: Design rules of learned layouts, and weight of their barrier relative to the error.
-RULES, BARRIER = fs.DesignRules(min_size_um=1.5, min_width_um=0.8, min_angle_deg=20.0), 1e-5
+RULES, BARRIER = fs.DesignRules(min_size_um=1.5, min_width_um=0.8, min_angle_deg=20.0, angle_limit_deg=26.0), 1e-5
 #: Arguments of a short version.
 QUICK = {"n_cells": 32, "n_steps": 40}
 

@@ -48,7 +48,7 @@ START_UM, OPTICS_RATE_UM, LAYOUT_RATE_UM = 0.02, 0.006, 0.1
 #: Random measurements per step of training.
 N_BATCH = 256
 #: Rules that keep photosites plausible during training, and the weight of their violation.
-RULES, BARRIER = fs.DesignRules(min_size_um=1.5, min_width_um=1.0, min_angle_deg=30.0), 1e-3
+RULES, BARRIER = fs.DesignRules(min_size_um=1.5, min_width_um=1.0, min_angle_deg=30.0, angle_limit_deg=26.0), 1e-3
 #: Parts that are trained, in one or two phases with the same total number of steps.
 CONDITIONS: dict[str, tuple[tuple[str, ...], ...]] = {
     "neither": (),

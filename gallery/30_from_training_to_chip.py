@@ -35,10 +35,12 @@ from foveasim.view import save_figure
 #: Pitch of the uniform grid; map cells are 1 µm wide.
 PITCH_UM = 3
 #: Rules of the chip, and rules of the repair, with a margin for vertices on the database grid of 1 nm.
-RULES = fs.DesignRules(min_size_um=2.0, min_width_um=1.8, min_angle_deg=60.0, max_overlap_um2=0.0, max_gap_um2=0.0)
-STRICT = fs.DesignRules(min_size_um=2.01, min_width_um=1.81, min_angle_deg=60.5)
+RULES = fs.DesignRules(
+    min_size_um=2.0, min_width_um=1.8, min_angle_deg=60.0, angle_limit_deg=26.0, max_overlap_um2=0.0, max_gap_um2=0.0
+)
+STRICT = fs.DesignRules(min_size_um=2.01, min_width_um=1.81, min_angle_deg=60.5, angle_limit_deg=26.0)
 #: Much weaker rules of training: sites remain convex, which the repair requires.
-WEAK = fs.DesignRules(min_width_um=0.75, min_angle_deg=40.0)
+WEAK = fs.DesignRules(min_width_um=0.75, min_angle_deg=40.0, angle_limit_deg=26.0)
 #: Model of pictures for training: 1/f² spectrum, standard deviation relative to the mean, blur of the lens.
 CONTRAST, BLUR_UM, MODES_FRACTION = 0.5, 0.65, 0.9999
 #: Importance of errors: a Gaussian around the gaze, with a standard deviation relative to the field, plus a constant.

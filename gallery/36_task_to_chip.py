@@ -50,8 +50,10 @@ RINGS_UM = (0.0, 10.0, 20.0, 30.0, 40.0)
 #: Number of photosites, exposure time, and noise, equal for all layouts.
 N_SITES, EXPOSURE_S, READ_NOISE_E, BITS, FRAMES_PER_S = 1024, 0.01, 5.0, 10, 30.0
 #: Rules of the chip, stricter ones of training with a margin for vertices on the database grid of 1 nm, and their weight.
-RULES = fs.DesignRules(min_size_um=1.0, min_width_um=0.6, min_angle_deg=30.0, max_overlap_um2=0.0, max_gap_um2=0.0)
-STRICT, BARRIER = fs.DesignRules(min_size_um=1.01, min_width_um=0.61, min_angle_deg=31.0), 3e-4
+RULES = fs.DesignRules(
+    min_size_um=1.0, min_width_um=0.6, min_angle_deg=30.0, angle_limit_deg=26.0, max_overlap_um2=0.0, max_gap_um2=0.0
+)
+STRICT, BARRIER = fs.DesignRules(min_size_um=1.01, min_width_um=0.61, min_angle_deg=31.0, angle_limit_deg=26.0), 3e-4
 #: Channels of the network, batch, and learning rates: of the network, and of vertices relative to the smallest photosite.
 CHANNELS, N_BATCH, NETWORK_RATE, VERTEX_RATE = (16, 48, 96), 64, 3e-3, 0.016
 #: Steps of training between changes of the network to the positions of the photosites.

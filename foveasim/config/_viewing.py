@@ -57,7 +57,7 @@ def read_viewable(
     Examples
     --------
     >>> import foveasim as fs
-    >>> view = fs.config.read_viewable("four_zones", rules="sky130_diff")
+    >>> view = fs.config.read_viewable("four_zones", rules="paper")
     >>> view.name, view.report.ok
     ('four_zones', True)
     """

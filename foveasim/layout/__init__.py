@@ -9,7 +9,7 @@ from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, graph_colouring, mosaic, random_channels
 from foveasim.layout.drc.measurements import RULES, Rule
 from foveasim.layout.drc.presets import PRESETS, Preset
-from foveasim.layout.drc.repair import Change, enforce, repair
+from foveasim.layout.drc.repair import Change, Changes, Stock, enforce, repair
 from foveasim.layout.drc.routing import Readout, Routing, track_demand
 from foveasim.layout.drc.rules import DesignRules, Report, RuleResult, Violation, min_width_um
 from foveasim.layout.edit_registry import EDITS, layout_edit
@@ -68,6 +68,7 @@ __all__ = [
     "PRESETS",
     "RULES",
     "Change",
+    "Changes",
     "DesignRules",
     "FileFormat",
     "Layout",
@@ -81,6 +82,7 @@ __all__ = [
     "RuleResult",
     "SiteGraph",
     "SolveFor",
+    "Stock",
     "Summary",
     "Violation",
     "WrittenLayout",

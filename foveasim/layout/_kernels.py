@@ -14,10 +14,6 @@ _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
 _flags = types.Array(types.boolean, 1, "C")
 
-#: Cosine of the largest angle (26 degrees) between antiparallel edges that face each other across the site. With 45 degrees,
-#: corners of octagons and the almost right angles between a chord and a side would count as widths. No two edges of a regular
-#: polygon enclose an angle with this cosine.
-MIN_FACING_COSINE = 0.9
 #: Length, in µm, up to which edges are those of vertices that differ by rounding, and common edges touch in a corner only.
 MIN_EDGE_UM = 1e-6
 
@@ -95,80 +91,79 @@ def _point_to_edge(px, py, ax, ay, bx, by):
 
 
 @njit()
-def _width_at_reflex_vertex(xy, a, b, after, first, last):
-    """Return the distance across the site from reflex vertex b to the nearest edge, else inf."""
-    bx, by = xy[b, 0], xy[b, 1]
-    in_x, in_y = bx - xy[a, 0], by - xy[a, 1]
-    out_x, out_y = xy[after[b], 0] - bx, xy[after[b], 1] - by
-    nearest = np.inf
-    if in_x * out_y - in_y * out_x >= 0.0:
-        return nearest
-    for k in range(first, last):
-        if k in (a, b):
-            continue
-        cx, cy = xy[k, 0], xy[k, 1]
-        ex, ey = xy[after[k], 0] - cx, xy[after[k], 1] - cy
-        if ex * (by - cy) - ey * (bx - cx) <= 0.0:  # the vertex is not on the inner side of the edge
-            continue
-        t = min(max(((bx - cx) * ex + (by - cy) * ey) / (ex * ex + ey * ey), 0.0), 1.0)
-        vx, vy = cx + t * ex - bx, cy + t * ey - by
-        # Across the site: within the sector between the extensions of both edges of the vertex.
-        if vx * in_x + vy * in_y >= 0.0 and vx * out_x + vy * out_y <= 0.0:
-            nearest = min(nearest, np.hypot(vx, vy))
-    return nearest
+def _segment_distance(ax, ay, bx, by, cx, cy, dx, dy):
+    """Return the distance between the segments a-b and c-d, which do not cross."""
+    near = min(_point_to_edge(ax, ay, cx, cy, dx, dy), _point_to_edge(bx, by, cx, cy, dx, dy))
+    near = min(near, _point_to_edge(cx, cy, ax, ay, bx, by))
+    return min(near, _point_to_edge(dx, dy, ax, ay, bx, by))
 
 
-@njit(types.float64[::1](_points, _ints, _ints, _ints, _ints))
-def min_widths(xy, after, before, ring_offsets, site_offsets):
+@njit()
+def _distance_inwards(ax, ay, bx, by, cx, cy, dx, dy):
+    """Return the distance of edge a-b to the part of edge c-d on its left, or infinity."""
+    ex, ey = bx - ax, by - ay
+    left_c, left_d = ex * (cy - ay) - ey * (cx - ax), ex * (dy - ay) - ey * (dx - ax)
+    if left_c <= 0.0 and left_d <= 0.0:
+        is_overlap = left_c == 0.0 and left_d == 0.0 and _segment_distance(ax, ay, bx, by, cx, cy, dx, dy) == 0.0
+        return 0.0 if is_overlap else np.inf
+    if left_c < 0.0:
+        t = left_c / (left_c - left_d)
+        cx, cy = cx + t * (dx - cx), cy + t * (dy - cy)
+    elif left_d < 0.0:
+        t = left_d / (left_d - left_c)
+        dx, dy = dx + t * (cx - dx), dy + t * (cy - dy)
+    return _segment_distance(ax, ay, bx, by, cx, cy, dx, dy)
+
+
+@njit(types.float64[::1](_points, _ints, _ints, types.float64, types.float64, types.float64))
+def facing_distances(xy, after, first_vertex, side, min_cosine, reach):
     """
-    Return the minimum width of each site.
+    Return the smallest distance of facing edges of each site, at most ``reach``.
 
-    The width is the smallest of three distances: between edges that face each other, from a reflex vertex across the site,
-    and between parallel lines that enclose the site. ``after[i]`` and ``before[i]`` are the neighbours of vertex i in its
-    ring. O(n_edge²) per site.
+    Edges face each other across the site for ``side`` 1, and across the space outside it (notches, slits, holes) for -1. They
+    enclose an angle whose cosine is above ``min_cosine``, and each counts as far as it is in front of the other. Edges with a
+    common vertex have the distance 0 where they enclose such an angle. O(n_edge²) per site.
     """
-    n_sites = site_offsets.size - 1
-    widths = np.empty(n_sites)
-    for site in range(n_sites):
-        first = ring_offsets[site_offsets[site]]
-        last = ring_offsets[site_offsets[site + 1]]
-        smallest = np.inf
-        for i in range(first, last):
-            ax, ay = xy[i, 0], xy[i, 1]
-            bx, by = xy[after[i], 0], xy[after[i], 1]
-            length = np.hypot(bx - ax, by - ay)
-            if length <= MIN_EDGE_UM:  # vertices that differ by rounding
-                continue
-            ex, ey = (bx - ax) / length, (by - ay) / length
-            low, high = np.inf, -np.inf
-            for k in range(first, last):
-                across = ex * (xy[k, 1] - ay) - ey * (xy[k, 0] - ax)
-                low, high = min(low, across), max(high, across)
-            smallest = min(smallest, high - low)
+    distances = np.empty(first_vertex.size - 1)
+    for site in range(distances.size):
+        first, last = first_vertex[site], first_vertex[site + 1]
+        smallest = reach
+        has_pairs = side > 0.0
+        for i in range(first, last):  # convex outlines have nothing in front of their outer sides
+            j = after[i]
+            k = after[j]
+            ex, ey, fx, fy = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1], xy[k, 0] - xy[j, 0], xy[k, 1] - xy[j, 1]
+            has_pairs = has_pairs or ex * fy - ey * fx < 0.0
+        for i in range(first, last if has_pairs else first):
+            a, b = (i, after[i]) if side > 0.0 else (after[i], i)
+            ax, ay, bx, by = xy[a, 0], xy[a, 1], xy[b, 0], xy[b, 1]
+            ex, ey = bx - ax, by - ay
+            left, right = min(ax, bx) - smallest, max(ax, bx) + smallest
+            low, high = min(ay, by) - smallest, max(ay, by) + smallest
             for k in range(i + 1, last):
-                if after[i] == k or after[k] == i:
+                c, d = (k, after[k]) if side > 0.0 else (after[k], k)
+                cx, cy, dx, dy = xy[c, 0], xy[c, 1], xy[d, 0], xy[d, 1]
+                fx, fy = dx - cx, dy - cy
+                opposed = -(ex * fx + ey * fy)
+                if (
+                    opposed <= 0.0
+                    or min(cx, dx) >= right
+                    or max(cx, dx) <= left
+                    or min(cy, dy) >= high
+                    or max(cy, dy) <= low
+                ):
                     continue
-                cx, cy = xy[k, 0], xy[k, 1]
-                dx, dy = xy[after[k], 0], xy[after[k], 1]
-                other = np.hypot(dx - cx, dy - cy)
-                if other <= MIN_EDGE_UM:
+                if min_cosine > 0.0 and opposed <= min_cosine * np.hypot(ex, ey) * np.hypot(fx, fy):
                     continue
-                fx, fy = (dx - cx) / other, (dy - cy) / other
-                if ex * fx + ey * fy > -MIN_FACING_COSINE:
-                    continue
-                # The interior is to the left of each edge: each edge must extend to the left side of the other.
-                if max(ex * (cy - ay) - ey * (cx - ax), ex * (dy - ay) - ey * (dx - ax)) <= 0.0:
-                    continue
-                if max(fx * (ay - cy) - fy * (ax - cx), fx * (by - cy) - fy * (bx - cx)) <= 0.0:
-                    continue
-                near = min(_point_to_edge(ax, ay, cx, cy, dx, dy), _point_to_edge(bx, by, cx, cy, dx, dy))
-                near = min(near, _point_to_edge(cx, cy, ax, ay, bx, by))
-                near = min(near, _point_to_edge(dx, dy, ax, ay, bx, by))
-                smallest = min(smallest, near)
-        for b in range(first, last):
-            smallest = min(smallest, _width_at_reflex_vertex(xy, before[b], b, after, first, last))
-        widths[site] = smallest
-    return widths
+                near = _distance_inwards(ax, ay, bx, by, cx, cy, dx, dy)
+                if near < smallest:
+                    near = max(near, _distance_inwards(cx, cy, dx, dy, ax, ay, bx, by))
+                    if near < smallest:
+                        smallest = near
+                        left, right = min(ax, bx) - smallest, max(ax, bx) + smallest
+                        low, high = min(ay, by) - smallest, max(ay, by) + smallest
+        distances[site] = smallest
+    return distances
 
 
 #: Relative difference of area below which two rectangles count as equal.
@@ -316,9 +311,7 @@ def _edge_to_edge(xy, a, b, c, d):
         and min(cy, dy) <= max(ay, by)
     ):
         return 0.0
-    near = min(_point_to_edge(ax, ay, cx, cy, dx, dy), _point_to_edge(bx, by, cx, cy, dx, dy))
-    near = min(near, _point_to_edge(cx, cy, ax, ay, bx, by))
-    return min(near, _point_to_edge(dx, dy, ax, ay, bx, by))
+    return _segment_distance(ax, ay, bx, by, cx, cy, dx, dy)
 
 
 @njit()

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from pyvista import PolyData  # noqa: TID251 -- a type alone
     from scipy.sparse import csr_array
 
-    from foveasim.layout.drc.repair import Change
+    from foveasim.layout.drc.repair import Changes
     from foveasim.layout.drc.routing import Readout
     from foveasim.layout.drc.rules import DesignRules, Report
     from foveasim.layout.files import WrittenLayout
@@ -328,7 +328,7 @@ class Layout:
                 f"the layout must be at least {MIN_LAYOUT_UM:g} µm wide, got {np.ptp(xy_um, axis=0).max():g} µm; "
                 "coordinates are in µm"
             )
-        xy_um, ring_offsets = _without_repeats(xy_um, ring_offsets)
+        xy_um, ring_offsets = without_repeats(xy_um, ring_offsets)
         _require(
             np.logical_or.reduceat(np.diff(ring_offsets) < 3, site_offsets[:-1]),
             "has a ring of fewer than 3 distinct vertices",
@@ -601,8 +601,8 @@ class Layout:
         return check(self, rules)
 
     def enforce(
-        self, rules: DesignRules, *, repair: Literal["drop", "shrink", "merge", "refill"] = "drop"
-    ) -> tuple[Layout, tuple[Change, ...]]:
+        self, rules: DesignRules, *, repair: Literal["best", "drop", "shrink", "merge", "refill"] = "best"
+    ) -> tuple[Layout, Changes]:
         """Repair violations of design rules; see :func:`foveasim.layout.enforce`."""
         from foveasim.layout.drc.repair import enforce
 
@@ -839,7 +839,7 @@ def valid_sites(layout: Layout) -> Bools:
     return is_valid
 
 
-def _without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:
+def without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:
     """Remove vertices equal to the next one, closing vertices included."""
     if ring_offsets.size == 1:
         return xy_um, ring_offsets

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import shapely
@@ -27,9 +27,8 @@ __all__ = ["barrier"]
 
 #: Edges below this length are points.
 MIN_EDGE_UM = 1e-6
-#: Cosines of the angle between antiparallel edges from which their distance begins to count as a width, and from which it
-#: counts completely, as in the design rule.
-FACING_COSINES = (0.85, 0.9)
+#: Angle above the limit of facing edges, in degrees, at which their distance begins to count.
+ANGLE_MARGIN_DEG = 6.0
 #: Relative difference of area below which two rectangles count as equal.
 AREA_ROUNDING = 1e-9
 #: Rules that do not depend on the positions of points which outlines share.
@@ -86,10 +85,10 @@ def barrier(
     Notes
     -----
     Measurements are those of :meth:`foveasim.Layout.check`, with these differences. All widths of a site count, not only the
-    smallest one, so that gradients have no kinks where two are equal. Distances between edges count gradually from an angle of
-    32 degrees between them, fully from the 26 degrees of the design rule. Edges shorter than 1e-6 µm, as those of
-    :class:`PowerCells`, are ignored. The rectangle of least area, for the aspect ratio, has a direction that may
-    change abruptly between edges of the site.
+    smallest one, so that gradients have no kinks where two are equal. Distances between edges count gradually from 6 degrees
+    above ``rules.angle_limit_deg``, and corners below this limit violate ``min_width_um``. Outlines are not rounded. Edges
+    shorter than 1e-6 µm, as those of :class:`PowerCells`, are ignored. The rectangle of least area, for the aspect ratio, has a
+    direction that may change abruptly between edges of the site.
     Clearances of ratios are relative to the distance of the limit from 1, and neighbours are sites that share an edge between
     two points.
 
@@ -101,7 +100,7 @@ def barrier(
     --------
     >>> import foveasim as fs
     >>> mesh = fs.learn.Mesh(fs.layout.grid(2, 2, 1.0))
-    >>> barrier(mesh(), mesh, fs.DesignRules(min_width_um=0.5, min_angle_deg=60.0), convex=True).item()
+    >>> barrier(mesh(), mesh, fs.DesignRules(min_width_um=0.5, angle_limit_deg=60.0), convex=True).item()
     0.0
     >>> round(barrier(mesh(), mesh, fs.DesignRules(min_size_um=0.98)).item(), 4)
     1.2239
@@ -110,7 +109,7 @@ def barrier(
         outlines = outlines.outlines
     points = outlines.check_points(points)
     limits = _limits(rules)
-    shape = _Shape(points, outlines)
+    shape = _Shape(points, outlines, rules.angle_limit_deg)
     penalty = points.new_zeros(())
     for name, limit in limits.items():
         for clearance, factor in MEASURES[name](shape, limit, margin_fraction):
@@ -157,12 +156,46 @@ def _smooth_log(u: Tensor, start: float) -> Tensor:
 Clearances = Iterator[tuple[Tensor, Tensor | float]]
 
 
+class _Segment(NamedTuple):
+    """Edges between points, (n, 2)."""
+
+    begin: Tensor
+    end: Tensor
+
+    @property
+    def unit(self) -> Tensor:
+        """Unit vectors along the edges."""
+        return _unit(self.end - self.begin)
+
+    def left_of(self, other: _Segment) -> _Segment:
+        """Return the parts to the left of the lines through other edges, which each have one."""
+        along = other.end - other.begin
+        left = [_cross(along, point - other.begin) for point in self]
+        step = left[0] - left[1]
+        t = left[0] / torch.where(step == 0.0, torch.ones_like(step), step)
+        crossing = self.begin + t[:, None] * (self.end - self.begin)
+        is_behind = [(side < 0.0)[:, None] for side in left]
+        return _Segment(*(torch.where(behind, crossing, point) for behind, point in zip(is_behind, self, strict=True)))
+
+    def end_distances(self, other: _Segment) -> Tensor:
+        """Return the distances of the end points of each of two edges from the other one, (n, 4)."""
+        return torch.stack([one.distance(point) for one, two in ((self, other), (other, self)) for point in two], dim=1)
+
+    def distance(self, point: Tensor) -> Tensor:
+        """Return the distances of points from the edges, (n,)."""
+        along = self.end - self.begin
+        length2 = (along * along).sum(dim=1).clamp(min=torch.finfo(along.dtype).tiny)
+        t = (((point - self.begin) * along).sum(dim=1) / length2).clamp(0.0, 1.0)
+        return _length(point - self.begin - t[:, None] * along)
+
+
 @dataclass(eq=False)
 class _Shape:
     """Measured quantities of outlines as tensors, and selections of vertices as arrays."""
 
     points: Tensor
     outlines: Outlines
+    angle_limit_deg: float
 
     @cached_property
     def area_um2(self) -> Tensor:
@@ -240,62 +273,30 @@ class _Shape:
         unit, to = self.unit_um[edge], self.xy_um[vertex] - self.xy_um[edge]
         return np.asarray(unit[:, 0] * to[:, 1] - unit[:, 1] * to[:, 0])
 
-    def distance_to_edge(self, vertex: Ints, edge: Ints) -> Tensor:
-        """Return the distances of vertices from edges."""
-        begin, to = self.at(edge), self.at(vertex)
-        along = self.at(self.outlines.edges.after[edge]) - begin
-        t = (((to - begin) * along).sum(dim=1) / (along * along).sum(dim=1)).clamp(0.0, 1.0)
-        return _length(to - begin - t[:, None] * along)
-
-    def strips(self) -> Tensor:
-        """Return the width of the strip along each edge that contains its site, (n_edge,)."""
-        edge, vertex = self.pairs
-        across = self.across_um(edge, vertex)
-        highest, lowest = _extremes(across, edge)
-        chosen, high, low = edge[highest], vertex[highest], vertex[lowest]
-        unit = _unit(self.at(self.outlines.edges.after[chosen]) - self.at(chosen))
-        return _cross(unit, self.at(high) - self.at(low))
-
     def facing_edges(self, reach_um: float) -> tuple[Tensor, Tensor]:
         """
-        Return distances of vertices from edges that face one of theirs, and factors.
+        Return distances of edges that face each other, four for each pair, and factors.
 
+        They are those of the end points of one edge, as far as it is in front of the other one, from the other, and vice versa.
         Distances above ``reach_um`` may be missing.
         """
+        begin, complete = (math.cos(math.radians(self.angle_limit_deg + extra)) for extra in (ANGLE_MARGIN_DEG, 0.0))
         edge, other = self.pairs
         after = self.outlines.edges.after
         is_pair = (edge < other) & self.is_distinct[other]
         edge, other = edge[is_pair], other[is_pair]
-        end, other_end = after[edge], after[other]
         is_pair = (self.ends[1][edge] != other) & (self.ends[1][other] != edge)
-        is_pair &= -(self.unit_um[edge] * self.unit_um[other]).sum(axis=1) > FACING_COSINES[0]
-        is_pair &= np.maximum(self.across_um(edge, other), self.across_um(edge, other_end)) > 0.0
-        is_pair &= np.maximum(self.across_um(other, edge), self.across_um(other, end)) > 0.0
-        edge, other, end, other_end = (each[is_pair] for each in (edge, other, end, other_end))
-        vertex = np.concatenate((edge, end, other, other_end))
-        to_edge = np.concatenate((other, other, edge, edge))
-        distance = self.distance_to_edge(vertex, to_edge)
-        directions = [_unit(self.at(after[each]) - self.at(each)) for each in (edge, other)]
-        cosine = -(directions[0] * directions[1]).sum(dim=1)
-        t = ((cosine - FACING_COSINES[0]) / (FACING_COSINES[1] - FACING_COSINES[0])).clamp(0.0, 1.0)
+        is_pair &= -(self.unit_um[edge] * self.unit_um[other]).sum(axis=1) > begin
+        is_pair &= np.maximum(self.across_um(edge, other), self.across_um(edge, after[other])) > 0.0
+        is_pair &= np.maximum(self.across_um(other, edge), self.across_um(other, after[edge])) > 0.0
+        one, two = (_Segment(self.at(each), self.at(after[each])) for each in (edge[is_pair], other[is_pair]))
+        distances = [one.end_distances(two.left_of(one)), two.end_distances(one.left_of(two))]
+        is_first = distances[0].amin(dim=1) >= distances[1].amin(dim=1)
+        distance = torch.where(is_first[:, None], *distances).T.reshape(-1)
+        cosine = -(one.unit * two.unit).sum(dim=1)
+        t = ((cosine - begin) / (complete - begin)).clamp(0.0, 1.0)
         is_near = torch.from_numpy(as_array(distance) < reach_um)
         return distance[is_near], (t * t * (3.0 - 2.0 * t)).repeat(4)[is_near]
-
-    def reflex_widths(self) -> Tensor:
-        """Return the distances from reflex vertices across their sites to edges."""
-        before, after = self.ends
-        into, out = self.xy_um - self.xy_um[before], self.xy_um[after] - self.xy_um
-        is_reflex = (into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0] < 0.0) & self.is_distinct
-        edge, vertex = self.pairs
-        is_pair = is_reflex[vertex] & (edge != vertex) & (self.ends[1][edge] != vertex)
-        edge, vertex = edge[is_pair], vertex[is_pair]
-        inside = self.across_um(edge, vertex) > 0.0
-        edge, vertex = edge[inside], vertex[inside]
-        begin, along = self.xy_um[edge], self.xy_um[self.outlines.edges.after[edge]] - self.xy_um[edge]
-        t = np.clip(((self.xy_um[vertex] - begin) * along).sum(axis=1) / (along * along).sum(axis=1), 0.0, 1.0)
-        ray = begin + t[:, np.newaxis] * along - self.xy_um[vertex]
-        is_across = ((ray * into[vertex]).sum(axis=1) >= 0.0) & ((ray * out[vertex]).sum(axis=1) <= 0.0)
-        return self.distance_to_edge(vertex[is_across], edge[is_across])
 
     def aspect_ratios(self) -> Tensor:
         """Return the aspect ratio of the minimum-area rectangle around each site."""
@@ -384,10 +385,9 @@ def _min_area(shape: _Shape, limit: float, margin_fraction: float) -> Clearances
 
 
 def _min_width(shape: _Shape, limit: float, margin_fraction: float) -> Clearances:
-    yield shape.strips() / limit - 1.0, 1.0
     distance, factor = shape.facing_edges((1.0 + margin_fraction) * limit)
     yield distance / limit - 1.0, factor
-    yield shape.reflex_widths() / limit - 1.0, 1.0
+    yield from _min_angle(shape, shape.angle_limit_deg, margin_fraction)
 
 
 def _min_angle(shape: _Shape, limit: float, margin_fraction: float) -> Clearances:  # noqa: ARG001

@@ -123,7 +123,7 @@ def test_rotated_voronoi_cells_share_same_edges():
     layout = fs.layout.fovi(fov_um=36.0, a_um=3.0, n_rings=12)
 
     assert abs(layout.rotate(30.0).adjacency() - layout.adjacency()).max() < 1e-9
-    assert layout.check(fs.DesignRules(min_width_um=0.4)).ok
+    assert layout.check(fs.DesignRules(min_width_um=0.4, angle_limit_deg=26.0)).ok
 
 
 @given(

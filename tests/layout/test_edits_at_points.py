@@ -181,7 +181,7 @@ def test_drawn_vertices_on_outlines_leave_no_repeats(rounding_um):
 
     assert edge_um.min() > 0.1
     assert drawn.area_um2.sum() == pytest.approx(1600.0)
-    assert fs.layout.min_width_um(drawn).min() > 0.1
+    assert fs.layout.min_width_um(drawn, angle_limit_deg=26.0).min() > 0.1
 
 
 def test_drawn_site_fills_only_gaps():

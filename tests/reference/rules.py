@@ -68,51 +68,40 @@ def holes(layout, _rules):
     ]
 
 
-def _width_um(polygon, facing_deg, slack):
-    """Return the width as defined for ``min_width_um``; ``slack`` is the tolerance of the cosine of right angles."""
-    rings = _edges(polygon)
-    edges = [edge for ring in rings for edge in ring]
-    lines = [shapely.LineString(edge) for edge in edges]
+def _left_part(edge, other):
+    """Return the part of another edge to the left of the line through an edge, or None."""
+    a, b = np.array(edge)
+    along = (b - a) / np.linalg.norm(b - a)
+    far = 1e4 * along
+    left = np.array([-along[1], along[0]])
+    a, b = a + 1e-7 * left, b + 1e-7 * left  # not edges on the same line
+    half_plane = shapely.Polygon([a - far, b + far, b + far + 1e4 * left, a - far + 1e4 * left])
+    part = shapely.LineString(other).intersection(half_plane)
+    return part if part.length > 1e-9 else None
+
+
+def _facing_um(polygon, side, angle_limit_deg):
+    """Return the smallest distance of facing edges, in front of each other, across a site (side 1) or outside it (-1)."""
+    edges = [edge[::side] for ring in _edges(polygon) for edge in ring]
     smallest = math.inf
-    for edge in edges:
-        _, low, _, high = rotate(polygon, -_heading_rad(edge), origin=(0, 0), use_radians=True).bounds
-        smallest = min(smallest, high - low)
-    for (e, a), (f, b) in combinations(zip(edges, lines, strict=True), 2):
-        if e[1] == f[0] or f[1] == e[0]:
+    for e, f in combinations(edges, 2):
+        u, v = np.subtract(e[1], e[0]), np.subtract(f[1], f[0])
+        if -u @ v / (np.linalg.norm(u) * np.linalg.norm(v)) <= math.cos(math.radians(angle_limit_deg)) + 1e-10:
             continue
-        turn_rad = math.remainder(_heading_rad(e) - _heading_rad(f) - math.pi, 2 * math.pi)
-        faces = any(_is_left(e, p) for p in f) and any(_is_left(f, p) for p in e)
-        if faces and abs(turn_rad) <= math.radians(facing_deg):
-            smallest = min(smallest, a.distance(b))
-    for ring in rings:
-        for into, out in pairwise([*ring, ring[0]]):
-            if _inner_angle_deg(into[0], into[1], out[1]) <= 180.0:
-                continue
-            corner = shapely.Point(into[1])
-            steps = [shapely.LineString(edge).interpolate(1e-3, normalized=True) for edge in (into[::-1], out)]
-            for edge, line in zip(edges, lines, strict=True):
-                if edge in (into, out) or not _is_left(edge, into[1]):
-                    continue
-                foot = line.interpolate(line.project(corner))
-                # Local minimum: moving from the corner along either of its edges does not reduce the distance.
-                if all(
-                    math.cos(_inner_angle_deg(step.coords[0], into[1], foot.coords[0]) * math.pi / 180.0) <= slack
-                    for step in steps
-                ):
-                    smallest = min(smallest, corner.distance(foot))
+        parts = _left_part(e, f), _left_part(f, e)
+        if None not in parts:
+            distances = shapely.LineString(e).distance(parts[0]), shapely.LineString(f).distance(parts[1])
+            smallest = min(smallest, max(distances))
     return smallest
 
 
-def widths(layout, _rules):
-    """Return widths; NaN at the tolerance of facing edges (26 degrees) or right angles, and for touching rings."""
+def widths(layout, rules):
+    """Return widths; NaN for touching rings."""
     measured = []
     for i, polygon in enumerate(layout.polygons()):
         vertices = [tuple(vertex) for ring in _edges(polygon) for vertex, _ in ring]
-        if len(set(vertices)) < len(vertices):
-            measured.append(((i,), math.nan))
-            continue
-        strict, lenient = _width_um(polygon, 25.8, -1e-9), _width_um(polygon, 26.0, 1e-9)
-        measured.append(((i,), strict if math.isclose(strict, lenient, rel_tol=1e-9) else math.nan))
+        is_clear = len(set(vertices)) == len(vertices)
+        measured.append(((i,), _facing_um(polygon, 1, rules.angle_limit_deg) if is_clear else math.nan))
     return measured
 
 
@@ -140,16 +129,17 @@ def corner_angles(layout, _rules):
 
 
 def edge_angles(layout, rules):
+    """Return deviations of directions, apart from those of rounding; multiples of 45 degrees have none."""
     step_deg = rules.edge_angle_step_deg
-    return [
-        (
-            (i,),
-            max(
-                abs(math.remainder(math.degrees(_heading_rad(edge)), step_deg))
-                for ring in _edges(polygon)
-                for edge in ring
-            ),
+
+    def off_deg(edge):
+        rounding_deg = (
+            math.degrees(math.atan(math.sqrt(2.0) * rules.dbu_um / math.dist(*edge))) if step_deg % 45 else 0.0
         )
+        return max(abs(math.remainder(math.degrees(_heading_rad(edge)), step_deg)) - rounding_deg, 0.0)
+
+    return [
+        ((i,), max(off_deg(edge) for ring in _edges(polygon) for edge in ring))
         for i, polygon in enumerate(layout.polygons())
     ]
 
@@ -162,7 +152,7 @@ def grid_deviations(layout, rules):
 
 
 def reaches(layout, rules):
-    x_min, y_min, x_max, y_max = rules.die_um
+    x_min, y_min, x_max, y_max = np.round(np.divide(rules.die_um, rules.dbu_um)) * rules.dbu_um
     return [
         (
             (i,),
@@ -176,16 +166,25 @@ def reaches(layout, rules):
 
 
 def spaces(layout, rules):
-    touching_um = max(TOUCHING_UM, rules.grid_um or 0.0)
+    """Return the distances of all pairs, and the widths of notches, slits and holes."""
     pairs = combinations(enumerate(layout.polygons()), 2)
-    measured = [((i, j), a.distance(b)) for (i, a), (j, b) in pairs]
-    return [(sites, space_um) for sites, space_um in measured if space_um > touching_um]
+    notches = [((i,), _facing_um(polygon, -1, rules.angle_limit_deg)) for i, polygon in enumerate(layout.polygons())]
+    return [((i, j), a.distance(b)) for (i, a), (j, b) in pairs] + [n for n in notches if n[1] < math.inf]
 
 
-def overlaps(layout, _rules):
+def is_sliver(shape, rules):
+    """Return whether the height of a triangle of the area and perimeter is at most half a diagonal of a grid pixel."""
+    return 2.0 * shape.area / (0.5 * shape.length) <= 0.72 * rules.dbu_um
+
+
+def overlaps(layout, rules):
     pairs = combinations(enumerate(layout.polygons()), 2)
-    measured = [((i, j), a.intersection(b).area, min(a.area, b.area)) for (i, a), (j, b) in pairs]
-    return [(sites, common) for sites, common, smaller in measured if common > AREA_ROUNDING * smaller]
+    measured = [((i, j), a.intersection(b), min(a.area, b.area)) for (i, a), (j, b) in pairs]
+    return [
+        (sites, common.area)
+        for sites, common, smaller in measured
+        if common.area > AREA_ROUNDING * smaller and not is_sliver(common, rules)
+    ]
 
 
 def _has_common_edge(a, b):
@@ -226,7 +225,7 @@ def gaps(layout, rules):
     if rules.die_um is None:
         field = shapely.box(*covered.bounds).buffer(10.0, join_style="mitre")
     else:
-        field = shapely.box(*rules.die_um)
+        field = shapely.box(*np.round(np.divide(rules.die_um, rules.dbu_um)) * rules.dbu_um)
     parts = [
         part.buffer(SLIT_UM, join_style="mitre", mitre_limit=1e4).intersection(field)
         for part in shapely.get_parts(field.difference(covered))
@@ -235,7 +234,7 @@ def gaps(layout, rules):
     return [
         (tuple(i for i, polygon in enumerate(polygons) if polygon.distance(part) < N_SLITS * SLIT_UM), part.area)
         for part in parts
-        if part.area > part.length * SLIT_UM
+        if part.area > part.length * SLIT_UM and not is_sliver(part, rules)
     ]
 
 
@@ -249,6 +248,19 @@ def growths(layout, _rules):
 
 def counts(layout, _rules):
     return [((), float(len(list(layout.polygons()))))]
+
+
+#: Rules of the outlines on the database grid; others apply to the outlines as drawn.
+MASK_RULES = {
+    "min_hole_um2", "min_width_um", "min_space_um", "min_angle_deg", "edge_angle_step_deg", "grid_um", "max_overlap_um2",
+    "max_gap_um2", "die_um",
+}  # fmt: skip
+
+
+def on_grid(layout, dbu_um=1e-3):
+    """Return a layout with rounded vertices."""
+    rounded = shapely.transform(layout.polygons(), lambda xy: np.round(np.round(xy / dbu_um) * dbu_um, 9))
+    return fs.Layout.from_polygons(rounded, **layout.columns)
 
 
 #: Reference implementation of every rule.
@@ -303,6 +315,36 @@ def _rugged(rng):
     wedge = shapely.Polygon(rng.uniform(0.0, 8.0, (3, 2)))
     parts = shapely.get_parts(shapely.union_all(bars).difference(wedge))
     return scale(rotate(max(parts, key=shapely.area), rng.choice([0.0, rng.uniform(0.0, 360.0)])), 0.5, 0.5)
+
+
+def _slotted(rng):
+    """Return a rectilinear site with slots and a hole, which may be narrow."""
+    size = rng.integers(2000, 6000, 2)
+    site = shapely.box(0, 0, *size)
+    for _ in range(int(rng.integers(1, 4))):
+        low, extent = rng.integers(-500, size), rng.choice([30, 100, 300, 900], 2)
+        site = site.difference(shapely.box(*low, *(low + extent + rng.integers(0, 50, 2))))
+    return scale(max(shapely.get_parts(site), key=shapely.area), 0.001, 0.001, origin=(0, 0))
+
+
+def _tipped(rng):
+    """Return a site with tips, pointed or cut off."""
+    n = int(rng.integers(3, 7))
+    angle = np.sort(rng.uniform(0.0, 2 * np.pi, n))
+    core = shapely.Point(0.0, 0.0).buffer(0.5, quad_segs=2)
+    for direction in angle:
+        length, half = rng.uniform(0.8, 3.0), rng.uniform(0.1, 0.4)
+        end = rng.choice([0.0, rng.uniform(0.02, 0.4)])
+        tip = shapely.Polygon([(0.0, -half), (length, -end / 2), (length, end / 2), (0.0, half)]).buffer(0.0)
+        core = core.union(rotate(tip, direction, origin=(0, 0), use_radians=True))
+    return core
+
+
+#: Random sites by kind: rectilinear and oblique, with holes, slots, notches and tips.
+SITES = {
+    "stars": _star, "hulls": _hull, "tilted rectangles": _tilted_rectangle, "rugged": _rugged, "slotted": _slotted,
+    "tipped": _tipped,
+}  # fmt: skip
 
 
 def _scatter(shape):

@@ -17,9 +17,10 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout._noding import intersections, node_edges
-from foveasim.layout.adjacency import TOUCHING_UM, near_boxes
+from foveasim.layout.adjacency import TOUCHING_UM, adjacency, near_boxes
+from foveasim.layout.database_grid import DEFAULT_DBU_UM, has_valid_outlines, on_grid, to_um
 from foveasim.layout.drc.routing import Readout, Routing, track_demand
-from foveasim.layout.model import Layout
+from foveasim.layout.model import Layout, layout_of, without_repeats
 
 if TYPE_CHECKING:
     from foveasim.layout.drc.rules import DesignRules
@@ -32,7 +33,11 @@ LENGTH_ROUNDING_UM = 1e-6
 AREA_ROUNDING = 1e-9
 #: A selection of fewer than one site in SMALL_SELECTION_RATIO is converted to polygons separately, without all other sites.
 SMALL_SELECTION_RATIO = 10
-#: Pairs per task of a thread.
+#: Overlaps and gaps with a mean width of fewer database units are due to the rounding of vertices.
+SLIVER_WIDTH = 0.36
+#: Angles within this difference of their cosines are not below a limit.
+ANGLE_ROUNDING = 1e-10
+#: Pairs or sites per task of a thread.
 PAIRS_PER_TASK = 100_000
 
 
@@ -61,7 +66,11 @@ class Contacts:
 
 @dataclass(frozen=True)
 class Case:
-    """A layout and its rules, with cached quantities that several measurements share."""
+    """
+    A layout and its rules, with cached quantities that several measurements share.
+
+    ``layout`` is as drawn: sizes, ratios and counts. ``mask`` is as manufactured: distances, angles, overlaps and gaps.
+    """
 
     layout: Layout
     rules: DesignRules
@@ -69,14 +78,43 @@ class Case:
     __repr__ = short_repr
 
     @cached_property
+    def _on_grid(self) -> tuple[Layout, Ints]:
+        """The mask, and the sites without a valid outline on the grid, which it has as drawn."""
+        snapped = on_grid(self.layout, self.rules.dbu_um)
+        if snapped is self.layout:
+            return snapped, np.zeros(0, np.int64)
+        lost = np.flatnonzero(~has_valid_outlines(snapped))
+        xy_um = snapped.xy_um
+        if lost.size:
+            first = self.layout.ring_offsets[self.layout.site_offsets]
+            is_lost = np.repeat(np.isin(np.arange(self.layout.n_sites), lost), np.diff(first))
+            xy_um = np.where(is_lost[:, np.newaxis], self.layout.xy_um, xy_um)
+        return layout_of(*without_repeats(xy_um, self.layout.ring_offsets), self.layout.site_offsets), lost
+
+    @property
+    def mask(self) -> Layout:
+        """The sites with vertices on the database grid, as files contain them."""
+        return self._on_grid[0]
+
+    @property
+    def lost_sites(self) -> Ints:
+        """Sites that collapse or cross themselves on the database grid."""
+        return self._on_grid[1]
+
+    @cached_property
+    def die_um(self) -> Floats:
+        """The die on the database grid, (4,)."""
+        return to_um(np.rint(np.asarray(self.rules.die_um) / self.rules.dbu_um), self.rules.dbu_um)
+
+    @cached_property
     def polygons(self) -> NDArray[Any]:
-        """The sites as shapely polygons."""
-        return self.layout.polygons()
+        """The sites of the mask as shapely polygons."""
+        return self.mask.polygons()
 
     def shapes(self, sites: Ints) -> NDArray[Any]:
-        """Return the given sites as shapely polygons."""
+        """Return the given sites of the mask as shapely polygons."""
         return (
-            self.layout[sites].polygons()
+            self.mask[sites].polygons()
             if SMALL_SELECTION_RATIO * sites.size < self.layout.n_sites
             else self.polygons[sites]
         )
@@ -88,7 +126,7 @@ class Case:
         The boxes have the shape (n, 4). The pairs are ordered by site.
         """
         n = self.layout.n_sites
-        site, box = near_boxes(np.concatenate((self.layout.site_bounds_um, box_um)), reach_um)
+        site, box = near_boxes(np.concatenate((self.mask.site_bounds_um, box_um)), reach_um)
         is_mixed = (site < n) & (box >= n)
         return box[is_mixed] - n, site[is_mixed]
 
@@ -106,20 +144,20 @@ class Case:
 
     @cached_property
     def after(self) -> Ints:
-        """Next vertex of every vertex in its ring."""
-        return next_vertex(self.layout.ring_offsets)
+        """Next vertex of every vertex of the mask in its ring."""
+        return next_vertex(self.mask.ring_offsets)
 
     @cached_property
     def first_vertex(self) -> Ints:
-        """Index of the first vertex of every site, (n_site + 1,)."""
-        return self.layout.ring_offsets[self.layout.site_offsets]
+        """Index of the first vertex of every site of the mask, (n_site + 1,)."""
+        return self.mask.ring_offsets[self.mask.site_offsets]
 
     @cached_property
     def contacts(self) -> Contacts:
         """All pairs of sites that may touch or violate ``min_space_um``."""
         from foveasim.layout import _kernels
 
-        layout = self.layout
+        layout = self.mask
         reach_um = max(float(self.rules.min_space_um or 0.0), 2.0 * TOUCHING_UM)
         first, second = near_boxes(layout.site_bounds_um, reach_um)
         box = layout.site_bounds_um
@@ -240,38 +278,76 @@ def _areas(case: Case) -> Floats:
     return case.layout.area_um2
 
 
-def _widths(case: Case) -> Floats:
-    return min_width_um(case.layout)
+def _facing_um(case: Case, side: float, reach_um: float) -> Floats:
+    """
+    Return the smallest distance of facing edges of every site.
+
+    ``side``: 1 across the site, -1 across the space outside.
+    Coordinates are integers, in database units: right angles are exact.
+    """
+    from foveasim.layout import _kernels
+
+    limit_deg, dbu_um = case.rules.angle_limit_deg, case.rules.dbu_um
+    min_cosine = 0.0 if limit_deg == 90.0 else math.cos(math.radians(limit_deg)) + ANGLE_ROUNDING
+    xy, first = np.rint(case.mask.xy_um / dbu_um), case.first_vertex
+
+    def distances(piece: slice) -> Floats:
+        ends = first[piece.start : piece.stop + 1]
+        return _kernels.facing_distances(xy, case.after, ends, side, min_cosine, reach_um / dbu_um)
+
+    found = parallel_map(distances, _task_slices(case.mask.n_sites), thread_count())
+    return np.concatenate(found) * dbu_um
+
+
+def _widths(case: Case) -> Measurement:
+    limit_um = float(case.rules.min_width_um or 0.0)
+    width_um = _facing_um(case, 1.0, limit_um + case.rules.dbu_um)
+    n_sharp = int(np.count_nonzero(width_um == 0.0))
+    note = (
+        f"{n_sharp} site{'s have' if n_sharp != 1 else ' has'} corners sharper than 'angle_limit_deg' "
+        f"({case.rules.angle_limit_deg:g}), which have the width 0"
+    )
+    return Measurement(width_um, note=note if n_sharp and limit_um > 0.0 else "")
 
 
 def _holes(case: Case) -> Measurement:
-    if case.layout.ring_offsets.size == case.layout.site_offsets.size:
+    mask = case.mask
+    if mask.ring_offsets.size == mask.site_offsets.size:
         return Measurement(np.zeros(0))
-    area_um2 = ring_area_um2(case.layout.xy_um, case.layout.ring_offsets)
+    area_um2 = ring_area_um2(mask.xy_um, mask.ring_offsets)
     holes = np.flatnonzero(area_um2 < 0.0)
-    site = np.searchsorted(case.layout.site_offsets, holes, side="right") - 1
+    site = np.searchsorted(mask.site_offsets, holes, side="right") - 1
 
     def markers(positions: Ints) -> list[Any]:
-        starts, stops = case.layout.ring_offsets[holes[positions]], case.layout.ring_offsets[holes[positions] + 1]
-        return [shapely.Polygon(case.layout.xy_um[a:b]) for a, b in zip(starts, stops, strict=True)]
+        starts, stops = mask.ring_offsets[holes[positions]], mask.ring_offsets[holes[positions] + 1]
+        return [shapely.Polygon(mask.xy_um[a:b]) for a, b in zip(starts, stops, strict=True)]
 
     return Measurement(-area_um2[holes], site[:, np.newaxis].__getitem__, markers)
 
 
 def _spaces(case: Case) -> Measurement:
-    found = case.contacts
-    # Abutting sites share their boundary; with a manufacturing grid, to within one grid step.
-    is_spaced = found.distance_um > max(LENGTH_ROUNDING_UM, case.rules.grid_um or 0.0)
-    n_abutting = int(np.count_nonzero(~is_spaced))
-    near = np.flatnonzero(is_spaced & (found.distance_um <= float(case.rules.min_space_um or 0.0)))
-    return Measurement(
-        found.distance_um[near],
-        lambda k: found.sites_of(near[k]),
-        lambda k: shapely.shortest_line(case.shapes(found.first[near[k]]), case.shapes(found.second[near[k]])),
-        f"not checked: {n_abutting} pair{'s' * (n_abutting != 1)} of touching sites; apply inset first"
-        if n_abutting
-        else "",
-    )
+    """Measure distances of sites, 0 where they touch, and widths of notches and holes."""
+    found, limit_um = case.contacts, float(case.rules.min_space_um or 0.0)
+    near = np.flatnonzero(found.distance_um <= limit_um)
+    notch_um = _facing_um(case, -1.0, limit_um + case.rules.dbu_um)
+    notched = np.flatnonzero(notch_um <= limit_um)
+    n_touching = int(np.count_nonzero(found.distance_um[near] <= LENGTH_ROUNDING_UM))
+
+    def sites(positions: Ints) -> list[tuple[int, ...]]:
+        pairs = found.sites_of(near).tolist()
+        return [tuple(pairs[k]) if k < near.size else (int(notched[k - near.size]),) for k in positions.tolist()]
+
+    def markers(positions: Ints) -> NDArray[np.object_]:
+        is_pair = positions < near.size
+        pair, site = near[positions[is_pair]], notched[positions[~is_pair] - near.size]
+        lines = np.empty(positions.size, dtype=object)
+        lines[is_pair] = shapely.shortest_line(case.shapes(found.first[pair]), case.shapes(found.second[pair]))
+        lines[~is_pair] = case.shapes(site)
+        return lines
+
+    note = f"{n_touching} pair{'s' * (n_touching != 1)} of sites touch or overlap; apply inset first"
+    values = np.concatenate((found.distance_um[near], notch_um[notched]))
+    return Measurement(values, sites, markers, note if n_touching and limit_um > 0.0 else "")
 
 
 def _aspect_ratios(case: Case) -> Measurement:
@@ -282,26 +358,36 @@ def _aspect_ratios(case: Case) -> Measurement:
 
 
 def _corner_angles(case: Case) -> Measurement:
-    out = case.layout.xy_um[case.after] - case.layout.xy_um
+    out = case.mask.xy_um[case.after] - case.mask.xy_um
     into = np.empty_like(out)
     into[case.after] = out
     turn_rad = np.arctan2(into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0], np.einsum("ij,ij->i", into, out))
-    return Measurement(_per_site(np.minimum, 180.0 - np.degrees(turn_rad), case.layout))
+    return Measurement(_per_site(np.minimum, 180.0 - np.degrees(turn_rad), case.mask))
 
 
 def _edge_angles(case: Case) -> Measurement:
+    """
+    Measure deviations from multiples of the step, apart from those of rounding.
+
+    Multiples of 45 degrees are exact on the grid, and must be.
+    """
     step_deg = float(case.rules.edge_angle_step_deg or 90.0)
-    along = case.layout.xy_um[case.after] - case.layout.xy_um
+    along = np.rint((case.mask.xy_um[case.after] - case.mask.xy_um) / case.rules.dbu_um)
     # Edges are undirected: 180 degrees are equivalent to 0.
     angle_deg = np.degrees(np.arctan2(along[:, 1], along[:, 0])) % 180.0
     off_deg = np.minimum(np.abs(angle_deg - step_deg * np.round(angle_deg / step_deg)), 180.0 - angle_deg)
-    return Measurement(_per_site(np.maximum, off_deg, case.layout))
+    if step_deg % 45.0 != 0.0:
+        length = np.maximum(np.hypot(along[:, 0], along[:, 1]), 1.0)
+        off_deg = np.maximum(off_deg - np.degrees(np.arctan2(math.sqrt(2.0), length)), 0.0)
+    return Measurement(_per_site(np.maximum, off_deg, case.mask))
 
 
 def _grid_deviations(case: Case) -> Measurement:
     step_um = float(case.rules.grid_um or 1.0)
-    off_um = np.abs(case.layout.xy_um - step_um * np.round(case.layout.xy_um / step_um)).max(axis=1)
-    return Measurement(_per_site(np.maximum, off_um, case.layout))
+    xy_um = case.mask.xy_um
+    return Measurement(
+        _per_site(np.maximum, np.abs(xy_um - step_um * np.round(xy_um / step_um)).max(axis=1), case.mask)
+    )
 
 
 def _per_site(reduction: np.ufunc, per_vertex: Floats, layout: Layout) -> Floats:
@@ -312,13 +398,25 @@ def _per_site(reduction: np.ufunc, per_vertex: Floats, layout: Layout) -> Floats
 
 
 def _overlaps(case: Case) -> Measurement:
-    found, area_um2 = case.contacts, case.layout.area_um2
+    found, area_um2 = case.contacts, case.mask.area_um2
     pairs = found.sites_of(~found.is_non_overlapping)
     min_um2 = AREA_ROUNDING * area_um2[pairs].min(axis=1, initial=np.inf)
     common = intersections(case.shapes(pairs[:, 0]), case.shapes(pairs[:, 1]), min_um2)
     common_um2 = shapely.area(common)
-    is_real = common_um2 > min_um2
+    is_real = (common_um2 > min_um2) & _is_wider_than_rounding(common, case)
     return Measurement(common_um2[is_real], pairs[is_real].__getitem__, common[is_real].take)
+
+
+def _is_wider_than_rounding(shapes: NDArray[Any], case: Case) -> Bools:
+    """
+    Return whether the mean width of shapes is above that of slivers from rounding.
+
+    A vertex that rounding moves off the oblique edge of a neighbour by at most half the diagonal of a pixel of the database
+    grid is on the edge for programs that snap edges to vertices, as KLayout: the triangle between them has half of this mean
+    width. Rounding of the ends of the edge, too, can cause more: such overlaps are real; :func:`foveasim.layout.snap`
+    avoids them.
+    """
+    return np.asarray(shapely.area(shapes) > SLIVER_WIDTH * case.rules.dbu_um * 0.5 * shapely.length(shapes))
 
 
 def _gaps(case: Case) -> Measurement:
@@ -328,7 +426,7 @@ def _gaps(case: Case) -> Measurement:
     Isolated sites are subtracted last. The unshared edges of the other sites bound faces, each of which is either
     completely covered or completely open.
     """
-    layout = case.layout
+    layout = case.mask
     area_um2 = layout.area_um2
     min_um2 = AREA_ROUNDING * float(area_um2.min()) if layout.n_sites else 0.0
     if _gap_area_bound_um2(case) <= max(min_um2, float(case.rules.max_gap_um2 or 0.0)):
@@ -339,9 +437,10 @@ def _gaps(case: Case) -> Measurement:
     # A corner on a rotated edge misses it by rounding; without noding, the faces on both sides would merge.
     lines = shapely.linestrings(np.stack(node_edges(boundary_um[:, 0], boundary_um[:, 1]), axis=1))
     if case.rules.die_um is not None:
-        lines = np.append(lines, shapely.box(*case.rules.die_um).exterior)
+        lines = np.append(lines, shapely.box(*case.die_um).exterior)
     faces = shapely.get_parts(shapely.polygonize([shapely.union_all(lines)]))
-    faces = _uncovered_faces(faces[shapely.area(faces) > min_um2], is_isolated, case)
+    faces = faces[(shapely.area(faces) > min_um2) & _is_wider_than_rounding(faces, case)]
+    faces = _uncovered_faces(faces, is_isolated, case)
 
     face, site = _isolated_sites_within(faces, is_isolated, case)
     open_um2 = shapely.area(faces) - np.bincount(face, area_um2[site], faces.size)
@@ -368,13 +467,13 @@ def _gap_area_bound_um2(case: Case) -> float:
     The bound is the area of the die, or of the bounding box of the sites, minus the area of the sites. It is infinite
     where sites may overlap or leave the die.
     """
-    layout = case.layout
+    layout = case.mask
     if not case.contacts.is_non_overlapping.all():
         return np.inf
     if case.rules.die_um is None:
         field = np.asarray(layout.bounds_um if layout.n_sites else np.zeros(4))
     else:
-        field = np.asarray(case.rules.die_um)
+        field = case.die_um
         if _reach_beyond_die(case).values.max(initial=0.0) > 0.0:
             return np.inf
     return float((field[2:] - field[:2]).prod() - layout.area_um2.sum())
@@ -382,12 +481,12 @@ def _gap_area_bound_um2(case: Case) -> float:
 
 def _is_isolated(case: Case) -> Bools:
     """Return the sites without holes that touch neither another site nor the die boundary."""
-    found, box = case.contacts, case.layout.site_bounds_um
+    found, box = case.contacts, case.mask.site_bounds_um
     touching = found.sites_of(found.distance_um <= LENGTH_ROUNDING_UM)
-    is_isolated = np.diff(case.layout.site_offsets) == 1
+    is_isolated = np.diff(case.mask.site_offsets) == 1
     is_isolated[touching.ravel()] = False
     if case.rules.die_um is not None:
-        die = np.asarray(case.rules.die_um)
+        die = case.die_um
         is_within = _reach_beyond_die(case).values < -LENGTH_ROUNDING_UM
         is_outside = np.maximum(die[:2] - box[:, 2:], box[:, :2] - die[2:]).max(axis=1) > LENGTH_ROUNDING_UM
         is_isolated &= is_within | is_outside
@@ -399,7 +498,7 @@ def _uncovered_faces(faces: NDArray[Any], is_isolated: Bools, case: Case) -> NDA
     inner = _inner_points(faces)
     is_open = np.ones(faces.size, bool)
     if case.rules.die_um is not None:
-        is_open = np.asarray(shapely.contains(shapely.box(*case.rules.die_um), inner))
+        is_open = np.asarray(shapely.contains(shapely.box(*case.die_um), inner))
     is_open[case.sites_at(inner, ~is_isolated)[0]] = False
     return faces[is_open]
 
@@ -417,7 +516,7 @@ def _isolated_sites_within(faces: NDArray[Any], is_isolated: Bools, case: Case) 
     face, site = case.sites_near(shapely.bounds(faces))
     face, site = face[is_isolated[site]], site[is_isolated[site]]
     shapely.prepare(faces)
-    is_inside = shapely.contains_xy(faces[face], case.layout.xy_um[case.first_vertex[site]])
+    is_inside = shapely.contains_xy(faces[face], case.mask.xy_um[case.first_vertex[site]])
     return face[is_inside], site[is_inside]
 
 
@@ -435,8 +534,7 @@ def _cut_out(face: Any, sites: Ints, case: Case) -> Any:
 
 
 def _reach_beyond_die(case: Case) -> Measurement:
-    die = np.asarray(case.rules.die_um)
-    box = case.layout.site_bounds_um
+    die, box = case.die_um, case.mask.site_bounds_um
     return Measurement(np.maximum(die[:2] - box[:, :2], box[:, 2:] - die[2:]).max(axis=1, initial=-np.inf))
 
 
@@ -456,22 +554,14 @@ def _growths(case: Case) -> Measurement:
 
 
 def _neighbour_ratios(case: Case) -> Measurement:
-    from foveasim.layout import _kernels
-
-    found, layout = case.contacts, case.layout
-    touching = np.flatnonzero(found.distance_um <= 2.0 * TOUCHING_UM)
-    a, b = found.first[touching], found.second[touching]
-
-    def shared_um(piece: slice) -> Floats:
-        return _kernels.shared_lengths(layout.xy_um, case.after, case.first_vertex, a[piece], b[piece], TOUCHING_UM)
-
-    pairs = touching[np.concatenate(parallel_map(shared_um, _task_slices(a.size), thread_count())) > 0.0]
-    size_um = layout.size_um
-    ratio = size_um[found.first[pairs]] / size_um[found.second[pairs]]
+    shared = adjacency(case.layout).tocoo()
+    is_upper = shared.row < shared.col
+    pairs = np.stack((shared.row[is_upper], shared.col[is_upper]), axis=1).astype(np.int64)
+    ratio = case.layout.size_um[pairs[:, 0]] / case.layout.size_um[pairs[:, 1]]
     return Measurement(
         np.maximum(ratio, 1.0 / ratio),
-        lambda k: found.sites_of(pairs[k]),
-        lambda k: shapely.linestrings(layout.centroid_um[found.sites_of(pairs[k])]),
+        pairs.__getitem__,
+        lambda k: shapely.linestrings(case.layout.centroid_um[pairs[k]]),
     )
 
 
@@ -590,7 +680,7 @@ _register(
     "min_width_um", "the width of a site is at least the limit", "µm", _widths, 10.0, 10.1, repair="merge"
 )  # fmt: skip
 _register(
-    "min_space_um", "the space between sites that do not touch is at least the limit", "µm", _spaces, 2.0, 2.1,
+    "min_space_um", "the space between sites, and in their notches and holes, is at least the limit", "µm", _spaces, 2.0, 2.1,
     {"layout": _SPACED}, repair="shrink",
 )  # fmt: skip
 _register(
@@ -602,7 +692,7 @@ _register(
 )
 _register(
     "edge_angle_step_deg", "edge angles are multiples of the limit", "degrees", _edge_angles, 90.0, 50.0,
-    is_deviation=True, rounding=1e-4,
+    is_deviation=True, rounding=1e-9,
 )  # fmt: skip
 _register("grid_um", "vertices lie on the manufacturing grid", "µm", _grid_deviations, 10.0, 3.0, is_deviation=True)
 _register(
@@ -658,13 +748,21 @@ def is_below_size(area_um2: Floats, min_size_um: float) -> Bools:
     return np.asarray(rule.excess(np.sqrt(area_um2), min_size_um) > rule.rounding)
 
 
-def min_width_um(layout: Layout) -> Floats:
+def min_width_um(layout: Layout, *, angle_limit_deg: float = 90.0, dbu_um: float = DEFAULT_DBU_UM) -> Floats:
     """
-    Compute the minimum width of every site, (n_site,) µm.
+    Compute the minimum width of every site on the database grid, (n_site,) µm.
 
-    The minimum of: the distance between two non-adjacent edges that face each other across the site (antiparallel
-    within 26 degrees); the distance from a reflex vertex straight across the site to an edge; the width of the
-    narrowest strip parallel to one of its edges that contains the site.
+    Parameters
+    ----------
+    layout : Layout
+    angle_limit_deg, dbu_um : float
+        As in :class:`foveasim.layout.DesignRules`.
+
+    Returns
+    -------
+    (n_site,) float64, µm
+        Smallest distance between two edges that face each other across the site, at an angle below the limit: 0 for sites
+        with sharper corners. Infinite without such edges.
 
     Examples
     --------
@@ -672,10 +770,7 @@ def min_width_um(layout: Layout) -> Floats:
     >>> fs.layout.min_width_um(fs.Layout.from_rectangles([[0.0, 0.0]], [[3.0, 1.5]])).tolist()
     [1.5]
     """
-    from foveasim.layout import _kernels
+    from foveasim.layout.drc.rules import DesignRules
 
-    after = next_vertex(layout.ring_offsets)
-    before = np.empty_like(after)
-    before[after] = np.arange(after.size)
-    widths: Floats = _kernels.min_widths(layout.xy_um, after, before, layout.ring_offsets, layout.site_offsets)
-    return widths
+    rules = DesignRules(angle_limit_deg=angle_limit_deg, dbu_um=dbu_um)
+    return _facing_um(Case(layout, rules), 1.0, math.inf)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
@@ -12,6 +13,7 @@ import shapely
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Ints
 from foveasim.errors import GeometryError, ParameterError
+from foveasim.layout.adjacency import TOUCHING_UM
 from foveasim.layout.drc.rules import RULES, DesignRules, Report, RuleResult, Violation
 from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.edits._parts import replace_sites
@@ -19,16 +21,18 @@ from foveasim.layout.edits.all_sites import joining_groups, merge, union
 from foveasim.layout.generators.tiling import fill
 from foveasim.layout.model import Layout, derived
 
-__all__ = ["Change", "enforce", "repair"]
+__all__ = ["Change", "Changes", "Stock", "enforce", "repair"]
 
-Repair: TypeAlias = Literal["drop", "shrink", "merge", "refill"]
+Repair: TypeAlias = Literal["best", "drop", "shrink", "merge", "refill"]
 
 #: Maximum number of merging rounds; a merged site may still be too small.
 MAX_ROUNDS = 100
 #: Rounds in which both sites of a pair retreat, and further ones in which the larger site retreats alone.
 BOTH_ROUNDS, LARGER_ROUNDS = 4, 12
-#: Additional distance of a retreat, for rounding: far below any manufacturing grid.
+#: Additional distance of a retreat; each further round adds a database unit, for the rounding of vertices.
 RETREAT_ROUNDING_UM = 1e-7
+#: Angle between the edges on both sides of an edge of a hexagon, less the rounding of its vertices.
+HEXAGON_DEG = 59.0
 #: Rounding of a distance in steps of the manufacturing grid.
 GRID_ROUNDING = 1e-6
 
@@ -57,7 +61,89 @@ class Change:
     __repr__ = short_repr
 
 
-def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> tuple[Layout, tuple[Change, ...]]:
+@dataclass(frozen=True, slots=True)
+class Stock:
+    """
+    Extent of a layout before or after a repair.
+
+    Attributes
+    ----------
+    n_sites : int
+    area_um2 : float, µm²
+        Total area of the sites.
+    min_size_um : float, µm
+        Size of the smallest site, the square root of its area; NaN without sites.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> Stock.of(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0))
+    Stock(n_sites=4, area_um2=36.0, min_size_um=3.0)
+    """
+
+    n_sites: int
+    area_um2: float
+    min_size_um: float
+
+    __repr__ = short_repr
+
+    @classmethod
+    def of(cls, layout: Layout) -> Stock:
+        """Return the extent of a layout."""
+        smallest = float(layout.size_um.min()) if layout.n_sites else math.nan
+        return cls(layout.n_sites, float(layout.area_um2.sum()), smallest)
+
+
+@dataclass(frozen=True, slots=True)
+class Changes(Sequence[Change]):
+    """
+    Sequence of the changes of a repair, with the extent of the layout before and after.
+
+    Attributes
+    ----------
+    changes : tuple of Change
+    before, after : Stock
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> rings = fs.layout.log_polar(n_sectors=32, r_min_um=2.0, r_max_um=50.0)
+    >>> print(rings.enforce(fs.DesignRules(min_size_um=1.0))[1])
+    512 -> 389 sites, area 6741.5 -> 6741.5 µm² (100 %), smallest site 0.434 -> 1.01 µm
+    min_size_um: 192 sites merged
+    """
+
+    changes: tuple[Change, ...]
+    before: Stock
+    after: Stock
+
+    __repr__ = short_repr
+
+    def __len__(self) -> int:
+        return len(self.changes)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.changes[index]
+
+    def __iter__(self) -> Iterator[Change]:
+        return iter(self.changes)
+
+    def __str__(self) -> str:
+        before, after = self.before, self.after
+        kept = f" ({100.0 * after.area_um2 / before.area_um2:.4g} %)" if before.area_um2 else ""
+        lines = [
+            (
+                f"{before.n_sites:,} -> {after.n_sites:,} sites, area {before.area_um2:.5g} -> {after.area_um2:.5g} µm²{kept}, "
+                f"smallest site {before.min_size_um:.3g} -> {after.min_size_um:.3g} µm"
+            )
+        ]
+        for rule, action in dict.fromkeys((change.rule, change.action) for change in self):
+            n_sites = len({i for c in self if (c.rule, c.action) == (rule, action) for i in c.site_ids})
+            lines.append(f"{rule}: {n_sites:,} site{'s' * (n_sites != 1)} {action}")
+        return "\n".join(lines)
+
+
+def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "best") -> tuple[Layout, Changes]:
     """
     Return a layout repaired to satisfy the rules, and the changes.
 
@@ -66,19 +152,21 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     layout : Layout
     rules : DesignRules
         Violations of waived rules are not repaired.
-    repair : {"drop", "shrink", "merge", "refill"}
+    repair : {"best", "drop", "shrink", "merge", "refill"}
         ``"drop"`` removes the sites that violate a rule (of two sites that overlap or are too close, the smaller one); a
         minimum size then leaves the blind spot of a foveal layout. ``"shrink"`` first cuts the outlines of sites that are too
         close, at equal distances from both (in multiples of ``grid_um``), and the larger one of two that overlap, and drops
         the remaining ones. ``"merge"`` first merges sites that are too small with
         the neighbour that shares the longest boundary, repeatedly, and drops the remaining ones. ``"refill"`` drops sites,
         and fills the area of sites that were too small, including the area that they enclose, with hexagons of the minimum
-        size. A new site has the column values of the nearest dropped site.
+        size. A new site has the column values of the nearest dropped site. ``"best"`` loses the least area: sites that are too
+        small are merged, those that are too close are cut, and only others are dropped.
 
     Returns
     -------
     layout : Layout
-    changes : tuple of Change
+    changes : Changes
+        Sequence of :class:`Change`, with the number of sites, the area and the smallest site before and after.
 
     Raises
     ------
@@ -90,7 +178,7 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     --------
     >>> from foveasim.layout import log_polar
     >>> rings = log_polar(n_sectors=32, r_min_um=2.0, r_max_um=50.0)
-    >>> legal, changes = enforce(rings, DesignRules(min_size_um=1.0))
+    >>> legal, changes = enforce(rings, DesignRules(min_size_um=1.0), repair="drop")
     >>> rings.n_sites, legal.n_sites, changes[0].action
     (512, 352, 'dropped')
     """
@@ -99,21 +187,21 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     current_index = np.arange(layout.n_sites)  # current index of each input site, -1 for dropped sites
     changes: list[Change] = []
     original = layout
-    if repair == "shrink":
-        layout = _shrink(layout, active, changes)
-    elif repair == "merge":
+    if repair in ("best", "merge"):
         layout, current_index = _merge_small(layout, active, current_index, changes)
+    if repair in ("best", "shrink"):
+        layout = _shrink(layout, active, current_index, changes)
     layout, current_index = _drop_violating_sites(layout, active, current_index, changes)
     if repair == "refill":
         layout = _refill(layout, original, active, changes)
     rest = layout.check(rules.only(lambda name: RULES[name].repair is None))
     if not rest.ok:
         raise GeometryError(f"the layout violates rules that removing sites cannot repair: {_format_violations(rest)}")
-    return layout, tuple(changes)
+    return layout, Changes(tuple(changes), Stock.of(original), Stock.of(layout))
 
 
 @layout_edit(example={"rules": DesignRules(min_size_um=5.0)})
-def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair = "drop") -> Layout:
+def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair = "best") -> Layout:
     """
     Return a layout repaired to satisfy the rules.
 
@@ -122,7 +210,7 @@ def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair =
     layout : Layout
     rules : DesignRules
         Required in Python. In settings files, those of the layout by default.
-    method : {"drop", "shrink", "merge", "refill"}
+    method : {"best", "drop", "shrink", "merge", "refill"}
         As ``repair`` of :func:`enforce`.
 
     Raises
@@ -165,7 +253,7 @@ def _drop_violating_sites(
     return layout, current_index
 
 
-def _shrink(layout: Layout, rules: DesignRules, changes: list[Change]) -> Layout:
+def _shrink(layout: Layout, rules: DesignRules, current_index: Ints, changes: list[Change]) -> Layout:
     """Cut outlines of sites that are too close or overlap, in rounds."""
     spacing = rules.only(lambda name: RULES[name].repair == "shrink")
     area_um2 = layout.area_um2
@@ -175,43 +263,71 @@ def _shrink(layout: Layout, rules: DesignRules, changes: list[Change]) -> Layout
         if report.ok:
             break
         polygons, size_um2 = layout.polygons(), layout.area_um2
-        cuts: dict[int, list[Any]] = {}
-        for violation in (found for result in report.results for found in result.violations):
+        new: dict[int, Any] = {}
+        for violation in (
+            found for result in report.results for found in result.violations if len(found.site_ids) == 2
+        ):
             smaller, larger = sorted(violation.site_ids, key=lambda site: float(size_um2[site]))
             is_overlap = violation.unit == "µm²"
             retreating = (larger,) if is_overlap or attempt >= BOTH_ROUNDS else (smaller, larger)
-            reach_um = 0.0 if is_overlap else _reach_um(violation, rules.grid_um, len(retreating))
+            reach_um = 0.0 if is_overlap else _reach_um(violation, rules, len(retreating), attempt)
             for site in retreating:
                 other = polygons[smaller if site == larger else larger]
-                cuts.setdefault(site, []).append(shapely.buffer(other, reach_um, join_style="mitre"))
+                new[site] = _largest(_retreat(new.get(site, polygons[site]), other, reach_um))
             shrunk.setdefault(violation.rule, set()).update(retreating)
-        sites = np.array(sorted(cuts), dtype=np.int64)
-        outlines = [_largest(shapely.difference(polygons[site], shapely.union_all(cuts[int(site)]))) for site in sites]
-        has_area = np.array([outline is not None for outline in outlines])
-        sites = sites[has_area]  # others are dropped afterwards
-        if not sites.size:
+        new = {site: outline for site, outline in new.items() if outline is not None}  # others are dropped afterwards
+        if not new:
             break
-        remaining = [outline for outline in outlines if outline is not None]
-        layout = replace_sites(layout, sites, remaining, sites, "shrunk by rules")
+        sites = np.array(sorted(new))
+        layout = replace_sites(layout, sites, [new[int(site)] for site in sites], sites, "shrunk by rules")
     lost_um2 = area_um2 - layout.area_um2
     for rule, found in shrunk.items():
-        ids = tuple(sorted(site for site in found if lost_um2[site] > 0.0))
-        if ids:
-            changes.append(Change(rule, "shrunk", ids, tuple(lost_um2[list(ids)].tolist())))
+        ids = np.flatnonzero(np.isin(current_index, [site for site in found if lost_um2[site] > 0.0]))
+        if ids.size:
+            lost = tuple(lost_um2[current_index[ids]].tolist())
+            changes.append(Change(rule, "shrunk", tuple(ids.tolist()), lost))
     return layout
 
 
-def _reach_um(violation: Violation, grid_um: float | None, n_retreating: int) -> float:
+def _retreat(site: Any, other: Any, reach_um: float) -> Any:
+    """
+    Return the part of a site at a distance from another one.
+
+    The cut is a line where a line along an edge of their hulls separates the two (separating axis theorem), so that no notch
+    arises; otherwise it follows the other outline.
+    """
+    if site is None or site.is_empty:
+        return None
+    hulls = [shapely.get_coordinates(shapely.convex_hull(polygon)) for polygon in (site, other)]
+    along = np.concatenate([np.diff(hull, axis=0) for hull in hulls])
+    along = along[np.hypot(*along.T) > 0.0]
+    normal = np.stack((-along[:, 1], along[:, 0]), axis=1) / np.hypot(*along.T)[:, np.newaxis]
+    normal = np.concatenate((normal, -normal))
+    top = (hulls[1] @ normal.T).max(axis=0)
+    gap = (hulls[0] @ normal.T).min(axis=0) - top
+    best = int(gap.argmax())
+    if gap[best] < -reach_um - TOUCHING_UM:
+        return shapely.difference(site, shapely.buffer(other, reach_um, join_style="mitre"))
+    n, t = normal[best], np.array([-normal[best][1], normal[best][0]])
+    far = 2.0 * float(np.ptp(np.concatenate(hulls), axis=0).sum()) + reach_um
+    corner = n * (top[best] + reach_um) + t * float(hulls[0].mean(axis=0) @ t)
+    beyond = shapely.Polygon([corner - far * t, corner + far * t, corner + far * (t + n), corner + far * (n - t)])
+    return shapely.intersection(site, beyond)
+
+
+def _reach_um(violation: Violation, rules: DesignRules, n_retreating: int, attempt: int) -> float:
     """Return the distance from the other site to which a site that is too close retreats."""
     retreat_um = (violation.limit - violation.value) / n_retreating
-    if grid_um:
-        retreat_um = math.ceil(retreat_um / grid_um - GRID_ROUNDING) * grid_um
+    if rules.grid_um:
+        retreat_um = math.ceil(retreat_um / rules.grid_um - GRID_ROUNDING) * rules.grid_um
         return violation.value + retreat_um
-    return violation.value + retreat_um + RETREAT_ROUNDING_UM
+    return violation.value + retreat_um + attempt * rules.dbu_um + RETREAT_ROUNDING_UM
 
 
 def _largest(shape: Any) -> Any:
     """Return the largest polygon of a shape, or None."""
+    if shape is None:
+        return None
     parts = shapely.get_parts(shape)
     parts = parts[shapely.area(parts) > 0.0]
     return parts[int(shapely.area(parts).argmax())] if parts.size else None
@@ -241,8 +357,12 @@ def _refill(layout: Layout, original: Layout, rules: DesignRules, changes: list[
 
 def _smallest_size_um(rules: DesignRules) -> float:
     """Return the smallest hexagon size that satisfies all minimum limits."""
-    across_um = (rules.min_width_um or 0.0) * math.sqrt(0.5 * math.sqrt(3.0))
-    return max(rules.min_size_um or 0.0, math.sqrt(rules.min_area_um2 or 0.0), across_um)
+    width_um = rules.min_width_um + 2.0 * rules.dbu_um if rules.min_width_um else 0.0
+    # Its narrowest part is a side where edges that enclose 60 degrees face each other, else the distance across flats.
+    per_width_um = (
+        math.sqrt(1.5 * math.sqrt(3.0)) if rules.angle_limit_deg >= HEXAGON_DEG else math.sqrt(0.5 * math.sqrt(3.0))
+    )
+    return max(rules.min_size_um or 0.0, math.sqrt(rules.min_area_um2 or 0.0), width_um * per_width_um)
 
 
 def _sites_to_remove(layout: Layout, result: RuleResult, is_dropped: Bools) -> Ints:

@@ -3,6 +3,9 @@ Design rules that a layout must satisfy to be manufactured, and reports of viola
 
 A rule has a limit; a limit of None disables the rule. Each rule measures a quantity per photosite (or pair, gap or ring),
 and values beyond the limit are violations. :func:`check` does not raise on violations, it collects them in a report.
+
+Rules hold for what will be manufactured: distances, angles, overlaps and gaps are those of the outlines on the database grid,
+as files contain them. Sizes, areas and ratios are those of the drawn outlines, which rounding changes by about one unit.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from foveasim._core.show import Drawn, drawn
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array
 from foveasim.errors import GeometryError, ParameterError, type_name
+from foveasim.layout.database_grid import DEFAULT_DBU_UM
 from foveasim.layout.drc.measurements import RULES, Case, Measurement, Rule, min_width_um
 from foveasim.layout.drc.presets import PRESETS
 from foveasim.layout.drc.routing import Readout, Routing
@@ -35,6 +39,7 @@ __all__ = ["RULES", "DesignRules", "Report", "RuleResult", "Violation", "check",
 
 
 ANGLE = Limits(at_least=0.0, above=0.0, at_most=180.0)
+FACING_ANGLE = Limits(above=0.0, at_most=90.0)
 #: Further parameter that a rule requires.
 REQUIRED = {
     "min_density": "density_window_um",
@@ -58,10 +63,13 @@ class DesignRules:
     min_hole_um2 : float, optional, µm²
         Minimum area of a hole in a site.
     min_width_um : float, optional, µm
-        Minimum distance between edges of a site that face each other across it.
+        Minimum Euclidean distance between edges of a site that face each other across it, at an angle below
+        ``angle_limit_deg``, as in KLayout's ``width`` with its option ``transparent``: pairs of edges behind other edges
+        count, too.
     min_space_um : float, optional, µm
-        Minimum distance between two sites that do not touch. Abutting sites satisfy this rule. To check the spacing of the
-        photosensitive areas, apply an inset first.
+        Minimum Euclidean distance between two sites, and between edges that face each other across a notch, slit or hole of a
+        site, as in KLayout's ``space``. Sites that touch or overlap have the distance 0. To check the spacing of the
+        photosensitive areas of abutting sites, apply an inset first.
     max_aspect_ratio : float, optional
         Maximum ratio of the longer to the shorter side of the minimum-area rectangle, at any angle, around a site. Of
         several such rectangles, the least elongated one counts.
@@ -70,9 +78,9 @@ class DesignRules:
     edge_angle_step_deg : float, optional, degrees
         Angle of which all edge angles must be multiples, for example 90 or 45.
     grid_um : float, optional, µm
-        Manufacturing grid; coordinates must be multiples of it.
+        Manufacturing grid; coordinates on the database grid must be multiples of it.
     max_overlap_um2 : float, optional, µm²
-        Maximum overlap of two sites; 0 allows none.
+        Maximum overlap of two sites; 0 allows none wider than the rounding of vertices.
     max_gap_um2 : float, optional, µm²
         Maximum area of a gap (a connected area without sites), within ``die_um`` where it is given, else enclosed by sites.
     die_um : (x_min, y_min, x_max, y_max), optional, µm
@@ -99,6 +107,12 @@ class DesignRules:
         Tracks, metal layers and direction of the lines.
     waivers : mapping of str to str, optional
         Rules that may be violated, each with the reason. They are still checked and reported.
+    dbu_um : float, µm
+        Database unit: rules apply to outlines whose vertices are rounded to multiples of it.
+    angle_limit_deg : float, degrees
+        Edges that enclose a smaller angle face each other. The default is that of KLayout: corners below 90 degrees have the
+        width 0, also those between the sides and the chord of an annular site. A smaller limit, at most ``min_angle_deg``,
+        leaves corners to that rule.
     custom : mapping of str to float, optional
         Limits of further rules, by their names in :data:`foveasim.layout.drc.RULES`.
     preset : str, optional
@@ -140,6 +154,8 @@ class DesignRules:
     max_track_utilisation: Annotated[float | None, NOT_NEGATIVE] = None
     routing: Routing | None = None
     waivers: Mapping[str, str] | None = None
+    dbu_um: Annotated[float, POSITIVE] = DEFAULT_DBU_UM
+    angle_limit_deg: Annotated[float, FACING_ANGLE] = 90.0
     custom: Mapping[str, float] | None = None
     preset: InitVar[str | None] = None
 
@@ -178,11 +194,9 @@ class DesignRules:
     def only(self, keep: Callable[[str], bool]) -> DesignRules:
         """Return the same limits for the rules that ``keep`` selects, and None for others."""
         own = {rule.name for rule in fields(self)}
-        return replace(
-            self,
-            custom={name: limit for name, limit in (self.custom or {}).items() if keep(name)},
-            **{name: None for name in RULES if name in own and not keep(name)},
-        )
+        changes: dict[str, Any] = {name: None for name in RULES if name in own and not keep(name)}
+        custom = {name: limit for name, limit in (self.custom or {}).items() if keep(name)}
+        return replace(self, custom=custom, **changes)
 
     def limits(self) -> dict[str, Any]:
         """Return the limits that are set by rule name, in the order of the rules."""
@@ -244,7 +258,7 @@ class RuleResult:
     waiver : str or None
         Reason why the rule may be violated.
     note : str
-        What the rule did not check, such as the space between sites that touch.
+        Cause of violations, such as sites that touch.
     """
 
     rule: str
@@ -458,7 +472,22 @@ def check(layout: Layout, rules: DesignRules) -> Report:
         values, locate = _violations(rule, found, bound, case)
         waiver = (rules.waivers or {}).get(name)
         results.append(RuleResult(name, rule.description, bound, rule.unit, values, waiver, locate, found.note))
+    if case.lost_sites.size:
+        results.append(_lost_on_grid(case))
     return Report(layout.n_sites, tuple(results), layout)
+
+
+def _lost_on_grid(case: Case) -> RuleResult:
+    """Return the violations of sites that no file can contain."""
+    lost, dbu_um = case.lost_sites, case.rules.dbu_um
+
+    def locate(part: slice) -> tuple[Any, Any]:
+        return lost[part][:, np.newaxis], case.shapes(lost[part])
+
+    return RuleResult(
+        "dbu_um", "outlines keep an area and do not cross themselves on the database grid", dbu_um, "µm",
+        np.full(lost.size, dbu_um), None, locate,
+    )  # fmt: skip
 
 
 def _measure(name: str, rule: Rule, case: Case) -> Measurement:

@@ -49,6 +49,7 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
 from foveasim._io.sandbox import WALL_TIME_FACTOR, run_in_sandbox
 from foveasim.errors import FileError, GeometryError, LayoutWarning, ParameterError
+from foveasim.layout.database_grid import DEFAULT_DBU_UM, has_valid_outlines, on_grid, to_um
 from foveasim.layout.files import _gdstk
 from foveasim.layout.files._columns import (
     CHANNEL,
@@ -81,15 +82,13 @@ from foveasim.layout.files._layers import (
     parse_layer_map,
     parse_selection,
 )
-from foveasim.layout.model import Layout, layout_of, valid_sites, winding_um2
+from foveasim.layout.model import Layout, layout_of
 
 __all__ = ["GDS_MAGIC", "OASIS_MAGIC", "read", "write"]
 
 GDS_MAGIC = b"\x00\x06\x00\x02"
 OASIS_MAGIC = b"%SEMI-OASIS\r\n"
 
-#: Database unit of most processes, and default of layout programs.
-DEFAULT_DBU_UM = 1e-3
 #: A larger displacement of a vertex by rounding causes a warning; the default database unit displaces by at most 0.71 nm.
 ROUNDING_TOLERANCE_NM = 1.0
 #: Maximum vertices of a GDSII polygon, without the closing one: gdstk warns of incompatibility above 8,190 in total.
@@ -313,7 +312,7 @@ class _Drawing:
         """Return polygons of gdstk for rings at the given origins, (n, 2)."""
         n_vertices = np.diff(self.ring_offsets)[ring]
         vertex = np.repeat(self.ring_offsets[:-1][ring], n_vertices) + positions_in_runs(n_vertices)
-        xy_um = _to_um(self.xy_dbu[vertex] + np.repeat(origin, n_vertices, axis=0), dbu_um)
+        xy_um = to_um(self.xy_dbu[vertex] + np.repeat(origin, n_vertices, axis=0), dbu_um)
         stops = np.cumsum(n_vertices)
         numbers = self.number[ring].T.tolist()
         return list(
@@ -344,8 +343,8 @@ def _draw(
     """Draw one site of each stack; ``first`` are their indices."""
     models = snapped[first]
     owner = np.repeat(np.arange(first.size), np.diff(models.ring_offsets[models.site_offsets]))
-    xy_um = models.xy_um - _to_um(origin[first], dbu_um)[owner]
-    models = layout_of(_to_um(np.rint(xy_um / dbu_um), dbu_um), models.ring_offsets, models.site_offsets)
+    xy_um = models.xy_um - to_um(origin[first], dbu_um)[owner]
+    models = layout_of(to_um(np.rint(xy_um / dbu_um), dbu_um), models.ring_offsets, models.site_offsets)
     channel = layout.channel[first] if any(d.datatype is None or d.channel is not None for d in drawn) else None
     outlines = hole_free_rings(models, max_vertices)
     tables, rings_um = [], []
@@ -407,7 +406,7 @@ def _draw_layout(
     (n, 2) int64: positions, in database units; those of a stack in the order of rows and columns.
     """
     placed = shapes_of_layout(drawn.name, layout, drawn.parameters)
-    rounded = shapely.transform(placed.polygons, lambda xy_um: _to_um(np.rint(xy_um / dbu_um), dbu_um))
+    rounded = shapely.transform(placed.polygons, lambda xy_um: to_um(np.rint(xy_um / dbu_um), dbu_um))
     invalid = np.flatnonzero(~shapely.is_valid(rounded))
     rounded[invalid] = shapely.set_precision(placed.polygons[invalid], dbu_um)
     parts, shape = shapely.get_parts(rounded, return_index=True)
@@ -421,7 +420,7 @@ def _draw_layout(
     _, first, stack = np.unique(stack, return_index=True, return_inverse=True)
     models = snapped[first]
     vertex_owner = np.repeat(first, np.diff(models.ring_offsets[models.site_offsets]))
-    relative_um = models.xy_um - _to_um(part_origin[vertex_owner], dbu_um)
+    relative_um = models.xy_um - to_um(part_origin[vertex_owner], dbu_um)
     at_origin = layout_of(relative_um, models.ring_offsets, models.site_offsets)
     owner, _, _, rings_um = hole_free_rings(at_origin, max_vertices)
     stacks = np.searchsorted(owner, np.arange(first.size + 1))
@@ -469,8 +468,8 @@ def _references(
         arrays.first.tolist(),
         arrays.n_x.tolist(),
         arrays.n_y.tolist(),
-        _to_um(origin[arrays.first], dbu_um).tolist(),
-        _to_um(arrays.pitch, dbu_um).tolist(),
+        to_um(origin[arrays.first], dbu_um).tolist(),
+        to_um(arrays.pitch, dbu_um).tolist(),
         arrays.number_steps.tolist(),
         strict=True,
     )
@@ -539,13 +538,6 @@ def _number_text(number: tuple[int, ...]) -> str:
     return f"photosite {number[0]} part {number[1]} of {number[2]}"
 
 
-def _to_um(xy_dbu: NDArray[Any], dbu_um: float) -> Floats:
-    """Convert to µm; correctly rounded where 1 µm is an integer number of database units."""
-    per_um = round(1.0 / dbu_um)
-    is_integer = per_um >= 1 and abs(per_um * dbu_um - 1.0) < 1e-12
-    return np.asarray(xy_dbu / per_um if is_integer else xy_dbu * dbu_um, dtype=np.float64)
-
-
 def _warn_of_rounding(layout: Layout, snapped: Layout, dbu_um: float) -> None:
     """Warn that rounding displaces a vertex by more than the tolerance."""
     displacement_nm = 1e3 * np.hypot(*(snapped.xy_um - layout.xy_um).T)
@@ -565,13 +557,9 @@ def _snap_to_grid(layout: Layout, dbu_um: float) -> tuple[Ints, Layout]:
         raise ParameterError(
             "dbu_um", f"must be >= {np.abs(layout.xy_um).max() / MAX_DBU:.3g} for this layout", dbu_um, "µm"
         )
-    xy_um = _to_um(xy_dbu, dbu_um)
-    # The holes are checked below.
-    is_on_grid = np.array_equal(xy_um, layout.xy_um)
-    snapped = layout if is_on_grid else layout_of(xy_um, layout.ring_offsets, layout.site_offsets)
+    snapped = on_grid(layout, dbu_um)
     if layout.n_sites:
-        is_flat = winding_um2(*snapped.rings_um) <= 0.0
-        is_bad = np.logical_or.reduceat(is_flat, layout.site_offsets[:-1]) | ~valid_sites(snapped)
+        is_bad = ~has_valid_outlines(snapped)
         if is_bad.any():
             bad = np.flatnonzero(is_bad)
             raise GeometryError(
@@ -620,7 +608,7 @@ def read(
         answer, shapes, covers, lines = _read_in_sandbox(path, is_oasis, wanted, list(filters), cell, n_bytes)
         counts, tags = shapes.counts, shapes.tags
         check_site_count(path, counts.size)
-        xy_um = _to_um(shapes.xy, answer["dbu_um"])
+        xy_um = to_um(shapes.xy, answer["dbu_um"])
         pieces, piece, first = _group_by_site(path, xy_um, counts, tags)
         columns = _columns(lines, tags[piece], first)
         columns = _with_channel(columns, tags[piece[first], 1:3], wanted)
@@ -648,7 +636,7 @@ def read(
             number = tags[piece, 8]
             is_filter = (number >= 0) & (site >= 0)
             equal = np.stack((site[is_filter], number[is_filter]))
-            covers_um = _to_um(covers.xy, answer["dbu_um"])
+            covers_um = to_um(covers.xy, answer["dbu_um"])
             channel = _covering_channels(path, layout, equal, covers_um, covers, filters)
             colours = {CHANNEL_LETTERS: "".join(FILTER_NAMES)} if have_colours else {}
             layout = layout.with_columns(channel=channel).with_provenance(about | colours)

@@ -123,7 +123,7 @@ def test_invalid_report_is_rejected(tmp_path, content, n_sites, message):
         read_lyrdb(path, n_sites)
 
 
-NOTE = "not checked: 6 pairs of touching sites; apply inset first"
+NOTE = "6 pairs of sites touch or overlap; apply inset first"
 
 
 def test_note_of_touching_sites_round_trips(tmp_path):

@@ -68,9 +68,11 @@ def test_edge_angle_rule_can_be_waived():
     waived.raise_if_failed()
 
 
-def test_space_rule_ignores_abutting_sites():
+def test_abutting_sites_have_no_space():
     abutting = fs.layout.grid(n_x=5, n_y=5, pitch_um=2.0)
-    assert abutting.check(fs.DesignRules(min_space_um=0.5)).ok
+    report = abutting.check(fs.DesignRules(min_space_um=0.5))
+    assert not report.ok
+    assert [v.value for v in report.violations] == [0.0] * (2 * 4 * 5 + 2 * 4 * 4)  # edges and corners in common
 
     layout = fs.Layout.from_polygons([shapely.box(0, 0, 2, 2), shapely.box(2.3, 0, 4, 2), shapely.box(0, 2.5, 2, 4)])
     report = layout.check(fs.DesignRules(min_space_um=0.5))
@@ -82,12 +84,12 @@ def test_space_rule_ignores_abutting_sites():
 @given(seed=st.integers(0, 10_000), limit_um=st.floats(0.1, 2.0))
 def test_spaces_match_pairwise_distances(seed, limit_um):
     rng = np.random.default_rng(seed)
-    layout = fs.Layout.from_rectangles(rng.uniform(0, 20, (25, 2)), rng.uniform(0.2, 2.0, (25, 2)))
+    layout = fs.Layout.from_rectangles(rng.integers(0, 20_000, (25, 2)) / 1000, rng.integers(100, 1000, (25, 2)) / 500)
     polygons = layout.polygons()
     expected = {
         pair
         for pair in combinations(range(25), 2)
-        if 1e-6 < shapely.distance(polygons[pair[0]], polygons[pair[1]]) < limit_um - 1e-6
+        if shapely.distance(polygons[pair[0]], polygons[pair[1]]) < limit_um - 1e-6
     }
 
     assert {v.site_ids for v in layout.check(fs.DesignRules(min_space_um=limit_um)).violations} == expected
@@ -201,7 +203,7 @@ def test_only_unwaived_violations_raise_error():
 def test_giotto_has_504_sites_below_minimum_width():
     """At a unit pixel of 6.45 µm, KLayout's width check finds the same sites: the two innermost of the 110 rings."""
     rings = fs.layout.giotto(n_rho=152, n_theta=252, n_fovea=42, n_across=1090, unit_um=6.45, fovea="none")
-    report = rings.check(fs.DesignRules(min_width_um=6.8))
+    report = rings.check(fs.DesignRules(min_width_um=6.8, angle_limit_deg=80.0))
     ids = [violation.site_ids[0] for violation in report.violations]
 
     assert rings.n_sites == 27_720
@@ -214,7 +216,8 @@ def test_edge_angle_ignores_direction(step_deg):
     upright = SQUARES.check(fs.DesignRules(edge_angle_step_deg=step_deg))
     expected = min(90.0 % step_deg, step_deg - 90.0 % step_deg)
 
-    assert {round(v.value, 9) for v in upright.violations} == ({round(expected, 9)} if expected else set())
+    # Less the rounding of an edge to the database grid.
+    assert np.unique([v.value for v in upright.violations]) == pytest.approx([expected] if expected else [], abs=0.1)
 
 
 def test_report_can_be_pickled():

@@ -10,7 +10,7 @@ import shapely
 from effort import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.rules import layouts
+from reference.rules import SITES, layouts
 from shapely.affinity import rotate
 
 import foveasim as fs
@@ -102,7 +102,10 @@ def test_klayout_finds_same_narrow_giotto_sites(giotto, tmp_path):
     centre_lines = [kdb.Edge(pair.first.bbox().center(), pair.second.bbox().center()) for pair in pairs.each()]
     midpoints = shapely.transform([edge_centre(edge) for edge in centre_lines], lambda xy: xy * dbu_um)
     pair, site = shapely.STRtree(giotto.polygons()).query(midpoints, predicate="intersects")
-    narrow = {violation.site_ids[0] for violation in giotto.check(fs.DesignRules(min_width_um=6.8)).violations}
+    narrow = {
+        violation.site_ids[0]
+        for violation in giotto.check(fs.DesignRules(min_width_um=6.8, angle_limit_deg=80.0)).violations
+    }
 
     assert region.count() == giotto.n_sites == 27_720
     assert np.bincount(pair).tolist() == [1] * pairs.count()
@@ -110,7 +113,111 @@ def test_klayout_finds_same_narrow_giotto_sites(giotto, tmp_path):
     assert set(site.tolist()) == narrow
 
 
+def sites_of_kind(kind, seed, n):
+    """Return random sites of a kind on the database grid, and a limit in database units for each."""
+    rng = np.random.default_rng(seed)
+    sites = list(on_grid([SITES[kind](rng) for _ in range(n)]).polygons())
+    return sites, rng.integers(20, 1500, len(sites)).tolist()
+
+
+def disagreements(kind, seed, n, rule, check, angle_deg=90.0):
+    """
+    Return the sites for which KLayout's verdict is another one, and the number that KLayout flags.
+
+    Its option ``transparent`` is set: by default it ignores pairs of edges behind other edges.
+    KLayout rounds the points where one edge passes the line of another to the grid: values within two database units of the
+    limit may differ.
+    """
+    wrong, n_flagged = [], 0
+    for site, limit_dbu in zip(*sites_of_kind(kind, seed, n), strict=True):
+        limit_um = limit_dbu * DBU_UM
+        region = kdb.Region([klayout_polygon(site)])
+        region.merged_semantics = False
+        options = (limit_dbu, False, kdb.Region.Euclidian, angle_deg, None, None)
+        is_flagged = not getattr(region, check)(*options, False).is_empty()
+        assert is_flagged or getattr(region, check)(*options).is_empty()
+        layout = fs.Layout.from_polygons([site])
+        by_limit = [
+            not layout.check(fs.DesignRules(**{rule: limit_um + shift_um}, angle_limit_deg=angle_deg)).ok
+            for shift_um in (-2.0 * DBU_UM, 0.0, 2.0 * DBU_UM)
+        ]
+        n_flagged += is_flagged
+        if by_limit[1] != is_flagged and by_limit[0] == by_limit[2]:
+            wrong.append((site.wkt, limit_um, is_flagged))
+    return wrong, n_flagged
+
+
+@pytest.mark.slow(keep=6)
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("angle_deg", [90.0, 50.0])
+@pytest.mark.parametrize(("rule", "check"), [("min_width_um", "width_check"), ("min_space_um", "notch_check")])
+@pytest.mark.parametrize("kind", SITES)
+def test_random_sites_match_klayout(kind, rule, check, angle_deg, seed):
+    wrong, n_flagged = disagreements(kind, seed, 84, rule, check, angle_deg)
+
+    assert wrong == []
+    is_convex = kind in ("hulls", "tilted rectangles")
+    assert n_flagged > 0 or is_convex
+
+
+# Each of these passed 0.14 µm of the first metal layer: a notch, a slit and a hole of 50 nm, and corners that touch.
+SPACES = {
+    "notch": [shapely.box(0, 0, 2, 2).difference(shapely.box(0.9, 1.5, 0.95, 2.5))],
+    "slit": [shapely.box(0, 0, 2, 2).difference(shapely.box(0.9, -1.0, 0.95, 1.5))],
+    "hole": [shapely.box(0, 0, 2, 2).difference(shapely.box(0.9, 0.5, 0.95, 1.5))],
+    "corners": [shapely.box(0, 0, 2, 2), shapely.box(2, 2, 4, 4)],
+}
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_spaces_that_klayout_flags_are_violations(name):
+    layout = fs.Layout.from_polygons(SPACES[name])
+    report = layout.check(fs.DesignRules(min_space_um=0.14))
+
+    assert not region_of(layout).space_check(140, False, kdb.Region.Euclidian, 90.0, None, None).is_empty()
+    assert [v.value for v in report.violations] == pytest.approx([0.0 if name == "corners" else 0.05])
+    assert layout.check(fs.DesignRules(min_space_um=0.04)).ok == (name != "corners")
+
+
+def test_truncated_tips_are_measured_between_their_sides():
+    # Sides that converge by 27.7 degrees, as those of a log-polar site of 13 sectors.
+    half = 1.0 * math.tan(math.pi / 13)
+    tip = shapely.Polygon([(1.0, -half), (4.0, -4.0 * half), (4.0, 4.0 * half), (1.0, half)])
+    layout = fs.Layout.from_polygons([tip])
+    rules = fs.DesignRules(min_width_um=1.0, angle_limit_deg=60.0)
+
+    assert [v.value for v in layout.check(rules).violations] == pytest.approx([2.0 * half], abs=2e-3)
+    assert [v.value for v in layout.check(fs.DesignRules(min_width_um=0.1)).violations] == [
+        0.0
+    ]  # corners of 76 degrees
+
+
 # -- spaces -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow(keep=2)
+@pytest.mark.parametrize("seed", range(10))
+def test_random_pairs_match_klayout(seed):
+    rng = np.random.default_rng(seed)
+    n_near = 0
+    for _ in range(50):
+        pair = [SITES[str(rng.choice(list(SITES)))](rng) for _ in range(2)]
+        move = rng.uniform(-4.0, 4.0, 2)
+        layout = on_grid([pair[0], shapely.transform(pair[1], lambda xy, move=move: xy + move)])
+        if layout.n_sites < 2:
+            continue
+        distance_um = float(shapely.distance(*layout.polygons()))
+        limit_dbu = int(rng.integers(20, 2000))
+        is_flagged = (
+            not region_of(layout).isolated_check(limit_dbu, False, kdb.Region.Euclidian, 90.0, None, None).is_empty()
+        )
+        found = layout.check(fs.DesignRules(min_space_um=limit_dbu * DBU_UM)).violations
+        is_near = any(len(v.site_ids) == 2 for v in found)
+        n_near += is_near
+        if distance_um == 0.0 or abs(distance_um - limit_dbu * DBU_UM) > 2.0 * DBU_UM:
+            # Sites that overlap have no space, whether or not edges face each other.
+            assert is_near == is_flagged or (distance_um == 0.0 and is_near), layout.polygons()
+    assert n_near > 5
 
 
 @given(seeds, st.integers(150, 1500))
@@ -204,7 +311,9 @@ def test_rectangle_overlaps_match_klayout(seed):
 def test_polygon_overlaps_match_klayout_within_rounding(layout):
     layout = on_grid(layout.polygons())
     violations = layout.check(fs.DesignRules(max_overlap_um2=0.0)).violations
-    perimeter_um = shapely.length([violation.marker for violation in violations]).sum()
+    polygons = layout.polygons()
+    first, second = shapely.STRtree(polygons).query(polygons, predicate="intersects")
+    perimeter_um = shapely.length(shapely.intersection(polygons[first], polygons[second])[first < second]).sum()
 
     assert sum(violation.value for violation in violations) == pytest.approx(
         overlap_um2(layout), rel=1e-9, abs=DBU_UM * perimeter_um + DBU_UM**2
@@ -217,6 +326,7 @@ def test_polygon_overlaps_match_klayout_within_rounding(layout):
 def test_klayout_report_has_same_item_counts(giotto, tmp_path):
     rules = fs.DesignRules(
         min_width_um=6.8,
+        angle_limit_deg=80.0,
         min_angle_deg=89.9,
         edge_angle_step_deg=45.0,
         max_gap_um2=0.0,

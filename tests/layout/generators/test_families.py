@@ -131,7 +131,8 @@ def test_sites_tile_without_gap_or_overlap(family):
     common_um2 = shapely.area(shapely.intersection(polygons[first], polygons[second])[first < second])
 
     assert common_um2.max(initial=0.0) <= 1e-9 * layout.area_um2.min()
-    assert layout.check(fs.DesignRules(max_overlap_um2=0.0)).ok
+    # Without common vertices on oblique edges, rounding to 1 nm makes real overlaps.
+    assert fs.layout.snap(layout, 0.001).check(fs.DesignRules(max_overlap_um2=0.0)).ok
     if family.area_um2 is None:
         return
     covered = shapely.union_all(polygons)
