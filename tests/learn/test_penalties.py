@@ -31,7 +31,8 @@ def worst_values(layout):
     """Worst measured value of each rule: limits that every layout violates make all values visible."""
     extreme = {name: 1e9 if name.startswith("min") else 0.0 for name in SUPPORTED} | {"min_angle_deg": 180.0}
     return {
-        result.rule: result.worst for result in layout.check(fs.DesignRules(**extreme, angle_limit_deg=12.0)).results
+        result.rule: result.worst
+        for result in layout.check(fs.DesignRules(**extreme, angle_limit_deg=12.0, dbu_um=1e-6)).results
     }
 
 
