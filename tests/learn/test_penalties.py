@@ -74,7 +74,7 @@ def test_penalty_is_positive_for_concave_violations():
         outlines, points = learn.Outlines.from_layout(layout)
         worst = worst_values(layout)
         for name in ("min_width_um", "min_angle_deg", "max_aspect_ratio"):
-            if not 0.0 < worst[name] < 1e9:  # a corner below the limit, or no edges that face each other
+            if not worst[name]:  # a corner below the limit, or no edges that face each other
                 continue
             tighter, looser = (1.002, 0.998) if name.startswith("min") else (0.998, 1.002)
             penalties = [
