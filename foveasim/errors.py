@@ -66,7 +66,8 @@ class FoveasimError(Exception):
     """
 
     def __init__(self, message: str = "", *, prefix: str = "") -> None:
-        super().__init__(prefix + _shorten(message))
+        # Names and values of files may contain control characters, which change terminals.
+        super().__init__(prefix + printable(_shorten(message), keep="\n"))
 
     def __reduce__(self) -> tuple[Any, ...]:
         state = dict(self.__dict__)

@@ -137,6 +137,19 @@ def _interpolant(table: ChiefRayTable) -> Callable[[Floats], Floats]:
     return found
 
 
+def cone_irradiance_sr(tangent: ArrayLike, radius: float) -> Floats:
+    """
+    Integrate a constant radiance over cones: irradiance over radiance, (n,) sr.
+
+    ``tangent``: tangents of the chief rays, (n,). ``radius``: tangent radius ρ of the cones. With the tangents t of the rays, a
+    cone is a disc around t₀, and the projected solid angle is ``dA / (1 + t²)²``: its integral is that of a uniform disc seen
+    from a parallel surface, ``π/2 (1 - (1 + t₀² - ρ²) / sqrt((1 + t₀² + ρ²)² - 4 ρ² t₀²))`` (P. D. Foote, Bull. Bur. Stand. 12,
+    583, 1915). For narrow cones it is ``π ρ² cos⁴``; on the axis it is ``π ρ² / (1 + ρ²)``, π sin² of the half-angle.
+    """
+    t2, r2 = np.square(np.asarray(tangent, np.float64)), radius * radius
+    return np.asarray(0.5 * math.pi * (1.0 - (1.0 + t2 - r2) / np.sqrt((1.0 + t2 + r2) ** 2 - 4.0 * r2 * t2)))
+
+
 @dataclass(frozen=True, eq=False)
 class Incidence:
     """

@@ -164,3 +164,57 @@ def test_sites_beyond_table_raise_errors():
         ParameterError, match="'image_height_um' must extend to 1000 µm, the largest distance of a site"
     ):
         _ = fs.Optics(focal_length_mm=8.0, f_number=2.0, chief_ray=table).incidence(FIELD_UM).chief_ray
+
+
+# -- irradiance ----------------------------------------------------------------------------------------------------------
+
+
+def irradiance_by_rays(tangent, radius, n=400):
+    """Sum the radiance 1 over the rays of a cone: midpoint rule over its disc in the plane of tangents."""
+    r, angle = (np.arange(n) + 0.5) / n * radius, 2.0 * np.pi * (np.arange(n) + 0.5) / n
+    x, y = tangent + r[:, None] * np.cos(angle), r[:, None] * np.sin(angle)
+    return float((r[:, None] / (1.0 + x * x + y * y) ** 2).sum() * radius / n * 2.0 * np.pi / n)
+
+
+def falloff(lens, height_um):
+    """Return the irradiance of a uniform scene at a height over that on the axis."""
+    scene = fs.Scene.flat(
+        shape=(3, 401), pitch_um=2.0 * height_um / 400 / lens.magnification(1.0), distance_m=1.0,
+        radiance_w_m2_sr_nm=1.0, wavelength_nm=[550.0], band_width_nm=1.0,
+    )  # fmt: skip
+    row = np.asarray(lens.power_map(scene).data[0, 1])
+    return float(row[-1] / row[200])
+
+
+@pytest.mark.filterwarnings("ignore:the image of the scene is only")
+@pytest.mark.parametrize("kind", ["thin", "aplanatic"])
+@pytest.mark.parametrize("exit_pupil_mm", [8.0, 12.0, np.inf])
+def test_irradiance_is_integral_over_the_cone(exit_pupil_mm, kind):
+    lens = fs.Optics(
+        focal_length_mm=8.0,
+        f_number=1.4,
+        exit_pupil_mm=exit_pupil_mm,
+        lens=kind,
+        padding="edge",
+        precision="double",
+        oversample=1,
+    )
+    height_um = 2000.0
+    radius = float(lens.incidence([[0.0, 0.0]], 1.0).radius)
+    expected = irradiance_by_rays(height_um / (1e3 * exit_pupil_mm), radius) / irradiance_by_rays(0.0, radius)
+
+    assert falloff(lens, height_um) == pytest.approx(expected, abs=2e-4)
+    sine2 = radius**2 / (1.0 + radius**2)
+    assert lens.irradiance_per_radiance(1.0) == pytest.approx(np.pi * sine2, rel=1e-9)
+    assert irradiance_by_rays(0.0, radius) == pytest.approx(np.pi * sine2, rel=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:the image of the scene is only")
+def test_table_of_chief_rays_determines_irradiance():
+    options = {"focal_length_mm": 8.0, "f_number": 2.0, "padding": "edge", "precision": "double", "oversample": 1}
+    angles = np.degrees(np.arctan(np.linspace(0.0, 0.25, 30)))
+    table = fs.optics.ChiefRayTable(np.linspace(0.0, 3000.0, 30).tolist(), angles.tolist())
+    by_pupil, by_table = fs.Optics(**options, exit_pupil_mm=12.0), fs.Optics(**options, chief_ray=table)
+
+    assert falloff(by_table, 2000.0) == pytest.approx(falloff(by_pupil, 2000.0), abs=1e-5)
+    assert falloff(fs.Optics(**options), 2000.0) < falloff(by_pupil, 2000.0) - 0.03

@@ -274,7 +274,14 @@ def _compile(function: Callable[..., Any], signature: Any, options: dict[str, An
     while True:
         try:
             with _no_garbage_collection():
-                return numba.njit(signature, cache=True, **options)(function)
+                compiled: Callable[..., Any] = numba.njit(signature, cache=True, **options)(function)
+            directory = _directory_of_other_code(compiled, function)
+            if directory is None:
+                return compiled
+            if directory in emptied:
+                raise _cache_error(directory, ValueError("it has the machine code of another kernel"))
+        except FileError:
+            raise
         except Exception as error:
             if "no locator available" in str(error):
                 cache_directory = str(Path(tempfile.gettempdir()) / "foveasim-numba")
@@ -319,6 +326,13 @@ def _is_cached(function: Callable[..., Any]) -> bool:
     is_elsewhere = bool(os.environ.get("NUMBA_CACHE_DIR")) or not os.access(source.parent, os.W_OK)
     pattern = f"{source.stem}.{function.__qualname__}-*py{sys.version_info.major}{sys.version_info.minor}*.nbi"
     return is_elsewhere or any((source.parent / "__pycache__").glob(pattern))
+
+
+def _directory_of_other_code(compiled: Any, function: Callable[..., Any]) -> Path | None:
+    """Return the cache directory if it has the code of another function, else None."""
+    wanted = function.__module__, function.__qualname__
+    names = {(found.fndesc.modname, found.fndesc.qualname) for found in compiled.overloads.values()}
+    return None if names == {wanted} else Path(compiled._cache.cache_path)  # noqa: SLF001 -- no public name
 
 
 def _find_cache_directory(error: BaseException | None) -> Path | None:

@@ -6,6 +6,8 @@ import sys
 import warnings
 from types import FrameType
 
+from foveasim.errors import printable
+
 PACKAGE = __name__.partition(".")[0]
 
 
@@ -15,4 +17,4 @@ def warn(message: str, category: type[Warning]) -> None:
     level = 2
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == PACKAGE:
         frame, level = frame.f_back, level + 1
-    warnings.warn(message, category, stacklevel=level)
+    warnings.warn(printable(message, keep="\n"), category, stacklevel=level)

@@ -600,10 +600,12 @@ class Camera:
         return expose(self, self._sensor, light, photo_e_per_s, time_s, streams, clock, **settings)
 
     def _check_exposure(self, light: Scene | PowerMap, photo_e_per_s: Floats, capture: Capture) -> None:
-        """Warn of an exposure that is wrong for a photograph."""
+        """Warn of an exposure that is wrong for the scene."""
         exposure_s = float(capture.settings["exposure_s"])
-        if isinstance(light, Scene) and light.is_picture and exposure_s > 0.0:
-            warn_of_exposure(self._sensor, photo_e_per_s, exposure_s, capture, self._warned)
+        if isinstance(light, Scene) and exposure_s > 0.0:
+            warn_of_exposure(
+                self._sensor, photo_e_per_s, exposure_s, capture, self._warned, is_picture=light.is_picture
+            )
 
     def _exposure_s(self, exposure_s: ExposureTime, photo_e_per_s: Floats) -> float:
         """Return an exposure time in seconds."""

@@ -134,21 +134,26 @@ def warn_of_coverage(
 
 
 def warn_of_exposure(
-    sensor: Sensor, photo_e_per_s: Floats, exposure_s: float, capture: Capture, warned: set[str]
+    sensor: Sensor, photo_e_per_s: Floats, exposure_s: float, capture: Capture, warned: set[str], *, is_picture: bool
 ) -> None:
     """
-    Warn when many sites of a photograph are saturated, or most of them receive no signal.
+    Warn when many sites are saturated, or most of them receive no signal.
 
+    Charts may be mostly dark: of those, all sites must receive no signal.
     The message contains the time of automatic exposure. ``warned``: causes of earlier warnings, which are not repeated.
     """
     n_sites = capture.code.size
     n_saturated = int(np.count_nonzero(sensor.are_saturated(capture.electrons, capture.code)))
     if n_saturated > MAX_SATURATED * n_sites:
         problem = f"{100.0 * n_saturated / n_sites:.0f} % of the photosites are saturated"
-    elif 2 * np.count_nonzero(photo_e_per_s * exposure_s < np.maximum(sensor.first_code_e, 1.0)) > n_sites:
-        problem = "more than half of the photosites receive less than one electron or one code"
     else:
-        return
+        is_dark = photo_e_per_s * exposure_s < np.maximum(sensor.first_code_e, 1.0)
+        if is_picture and 2 * np.count_nonzero(is_dark) > n_sites:
+            problem = "more than half of the photosites receive less than one electron or one code"
+        elif not is_picture and is_dark.all() and photo_e_per_s.any():
+            problem = "all photosites receive less than one electron or one code"
+        else:
+            return
     cause = problem.split("photosites")[1]
     if cause in warned:
         return
@@ -237,7 +242,10 @@ def warn_of_coarse_cells(optics: Optics, scene: Scene, layout: Layout) -> None:
     reason, cure = (
         ("source pixels are points farther apart than λN", 'use source_pixel="square"')
         if is_lattice
-        else ("more would exceed its limits", "set Optics(oversample=...), or use a smaller picture")
+        else (
+            "more cells of the picture, or of the padding for its blur, would exceed its limits",
+            "set Optics(oversample=...), or use a smaller picture, or less aberration",
+        )
     )
     warn(
         f"automatic oversampling chooses {k} x {k} cells of {pixel_um / k:.3g} µm per source pixel, since {reason}: "

@@ -79,9 +79,11 @@ class SensorLayer(nn.Module):
     The precision is that of the pictures: float32 or float64. Under autocast, and for pictures of 16 bits, the layer computes
     in float32, as sums over cells and Fourier transforms lose too much in bfloat16.
 
-    A gaze per picture shifts the spectrum of its image, which is exact for the continuous image. It therefore differs from
-    :meth:`Camera.capture` with the same gaze by the accuracy of the integration, and is differentiable. Beyond the picture, the
-    image continues as its padding.
+    A gaze per picture shifts the spectrum of its image, which is exact for the continuous image where the cells of the map
+    resolve it, as those of automatic oversampling do for square source pixels, and for pixels narrower than λN. It then
+    differs from :meth:`Camera.capture` with the same gaze by the accuracy of the integration. With coarser cells, images
+    shifted by parts of a cell ring at edges: a :class:`foveasim.errors.SamplingWarning` states the error. Beyond the picture,
+    the image continues as its padding.
 
     Examples
     --------

@@ -11,10 +11,11 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor, nn
 
+from foveasim._core.user_warnings import warn
 from foveasim._io.mapped_files import in_memory
 from foveasim.camera import Camera
 from foveasim.camera._footprints import placed
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator, UndistortedOutlines
 from foveasim.learn._tensors import Constants, Parts, SparseMap, check_tensor, checked_gazes, constant, in_parts
@@ -32,6 +33,8 @@ from foveasim.units import photon_energy_j, w_from_w_m2_um2
 
 __all__ = ["VARIABLES", "Model", "capture"]
 
+#: Error of photosites above which shifted images cause a warning.
+MAX_SHIFT_ERROR = 1e-2
 #: Variables of a camera.
 VARIABLES = ("vertices", *LENS_VARIABLES, "distortion", "filters", "qe", "exposure_s")
 
@@ -110,6 +113,7 @@ class Model(nn.Module):
         )
         self.grid: Grid = camera.sensor_frame(self._scene).image(self.imaging.grid)
         self.order = camera.order(self._scene)
+        self._cell_error = camera.optics.auto_oversample_error(self._scene)
         self._footprints = camera.footprints(scene)
         if self._footprints is not None and "vertices" in self.wrt:
             raise ParameterError(
@@ -312,6 +316,13 @@ class Model(nn.Module):
             )
         if self._footprints is not None:
             raise ParameterError("gaze_um", "must be that of the camera with pixel optics: create one layer per gaze")
+        if self._cell_error > MAX_SHIFT_ERROR and not torch.compiler.is_compiling():
+            warn(
+                "the cells of the map are too coarse for the finest details of the image, so that shifted images ring at "
+                f"edges: errors up to {100.0 * self._cell_error:.2g} % for gazes between cells; use Optics(oversample=...), "
+                'source_pixel="square", or a scene with finer pixels',
+                SamplingWarning,
+            )
         return gazes_um.to(basis) / self.grid_pitch_um(basis)
 
     def grid_pitch_um(self, like: Tensor) -> Tensor:

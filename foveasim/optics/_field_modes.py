@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -34,12 +35,10 @@ MAX_WAVELENGTHS = 3
 #: Largest number of samples of all PSFs, 1 GiB in single precision: more wavelengths than one, and more points, are omitted
 #: beyond it. Up to the second number, they are in double precision.
 MAX_SAMPLES, MAX_DOUBLE_SAMPLES = 1 << 28, 1 << 22
-#: Multiple of the tolerance that twice as many points are expected to reach: the error of cubic splines decreases by 16.
-PROMISING = 10.0
 #: Largest number of samples across the aperture, a blur of 24 λN, for more points: a first frame of some 30 s.
 MAX_ACROSS = 384
 #: If the tolerance cannot be reached, the modes displace this multiple of the least possible.
-UNREACHED = 1.1
+UNREACHED = 1.02
 #: Samples whose products are computed in double precision together.
 SAMPLES_TOGETHER = 1 << 16
 
@@ -158,8 +157,11 @@ def find_modes(
     found: FieldModes | None = None
     for n_points in FIELD_POINTS:
         is_affordable = sampling.n_across <= MAX_ACROSS and 2 * n_points * n_points * sampling.n_samples <= MAX_SAMPLES
-        if found is None or (is_affordable and found.displaced <= PROMISING * tolerance):
+        if found is None:
             found = _modes_at(aperture, grid, sampling, n_points, tolerance, n_modes, n_threads)
+        elif is_affordable:
+            finer = _modes_at(aperture, grid, sampling, n_points, tolerance, n_modes, n_threads)
+            found = min(found, finer, key=attrgetter("displaced"))
         if n_modes is not None or found.displaced <= tolerance:
             break
     assert found is not None

@@ -20,7 +20,7 @@ from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_number, check_point, finite_array, read_only, wavelengths_nm
 from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid, PowerMap, SceneLike
-from foveasim.incidence import N_RINGS, N_RINGS_OF_PUPILS, ChiefRayTable, Incidence
+from foveasim.incidence import N_RINGS, N_RINGS_OF_PUPILS, ChiefRayTable, Incidence, cone_irradiance_sr
 from foveasim.optics._aperture import Aperture, PSFModel, Wavefront, overlaps
 from foveasim.optics._illumination import IlluminationTable
 from foveasim.optics._point_images import Point, PointImages
@@ -60,10 +60,14 @@ CELL_ERROR, CELL_ERROR_POWER, LARGEST_CELL_ERROR = 0.16, -3.1, 0.2
 ILLUMINATION_POINTS = 65
 #: Rounding error of interpolated relative illumination.
 ILLUMINATION_ROUNDING = 1e-12
+#: An aplanatic lens has a sine of at most 1, and cones have a tangent radius of at most 1.
+MIN_APLANATIC_F_NUMBER = 0.7072
 #: Memory limit of a map: 16 GiB in single precision.
 MAX_CELLS = 1 << 32
 #: Memory limit of a map with automatic oversampling: 512 MiB in single precision.
 MAX_AUTO_CELLS = 1 << 27
+#: Limit of the cells around such a map, for the light that the blur spreads.
+MAX_AUTO_PADDING_CELLS = 1 << 24
 
 
 def _pitch_um(scene: SceneLike) -> float:
@@ -152,9 +156,11 @@ class Optics(PointImages):
         Precision of the Fourier transforms and the maps.
     exit_pupil_mm : float, optional, mm
         Distance of the exit pupil from the sensor, infinity for a telecentric lens; by default that of the thin lens, its image
-        distance. It determines the chief ray angles at the sites of a sensor with ``pixel_optics``: see :meth:`incidence`.
+        distance. It determines the chief ray angles at the sites of a sensor with ``pixel_optics`` (see :meth:`incidence`), and
+        the relative illumination: the integral of the radiance over the cone at each point, instead of the law of the fourth
+        power of the cosine of the field angle. For pupils with a central obscuration it is that of the clear circle.
     chief_ray : ChiefRayTable, optional
-        Chief ray angles at image heights, instead of an exit pupil.
+        Chief ray angles at image heights, instead of an exit pupil; beyond the last height, those there.
 
     Notes
     -----
@@ -333,8 +339,9 @@ class Optics(PointImages):
         Returns
         -------
         Incidence
-            Cones of tangent radius ``1 / 2N`` of the image-side f-number N around chief rays from the centre of the exit pupil,
-            ``t = r / D``, or from the table. Rays are weighted with the transmittance of the pupil at 550 nm.
+            Cones around chief rays from the centre of the exit pupil, ``t = r / D``, or from the table. Their tangent radius is
+            that of the flat pupil, ``1 / 2N`` with the image-side f-number N, or ``1 / sqrt(4 N² - 1)`` for an aplanatic lens,
+            whose sine is ``1 / 2N``. Rays are weighted with the transmittance of the pupil at 550 nm.
 
         Raises
         ------
@@ -360,13 +367,26 @@ class Optics(PointImages):
 
         return Incidence(
             np.asarray(field_um),
-            radius=0.5 / self.working_f_number(distance_m),
+            radius=self._cone_radius(distance_m),
             exit_pupil_um=float(um_from_m(m_from_mm(distance_mm))),
             table=self.chief_ray,
             displacement_um=displacement_um,
             transmission=transmission if pupils else None,
             n_rings=N_RINGS_OF_PUPILS if pupils else N_RINGS,
         )
+
+    def _cone_radius(self, distance_m: float) -> float:
+        """Return the tangent of the half-angle of the image-side cone."""
+        n = self.working_f_number(distance_m)
+        if self.lens == "thin":
+            return 0.5 / n
+        if n <= MIN_APLANATIC_F_NUMBER:
+            raise ParameterError(
+                "f_number",
+                f"must be > {MIN_APLANATIC_F_NUMBER} at the image of an aplanatic lens for cones of light",
+                n,
+            )
+        return 1.0 / math.sqrt(4.0 * n * n - 1.0)
 
     def grid(self, scene: SceneLike) -> Grid:
         """Return the upright sensor-plane grid of the scene pixels, centred as the scene."""
@@ -430,19 +450,36 @@ class Optics(PointImages):
         k : int
             The smallest number with at least 5.5 cells per λN at the shortest wavelength, so that the fraction of a point's
             energy that a photosite of side λN collects is accurate to 1e-3 at second order. It is smaller if the map would
-            exceed 2^27 cells, and at most 16. It is 1 if the source pixels are points and farther apart than λN, where finer
-            cells would resolve single emitters. A camera warns where :meth:`auto_oversample_error` exceeds 1e-3.
+            exceed 2^27 cells, or the padding around it, which strong aberrations require, 2^24 cells, and at most 16. It is 1
+            if the source pixels are points and farther apart than λN, where finer cells would resolve single emitters. A camera
+            warns where :meth:`auto_oversample_error` exceeds 1e-3.
         """
         per_lambda_n = self._pixels_per_lambda_n(scene)
         if per_lambda_n < 1.0 and self.source_pixel == "point":
             return 1
         wanted = math.ceil(FINE_CELLS_PER_LAMBDA_N / per_lambda_n * (1.0 - 1e-9))
-        affordable = math.isqrt(MAX_AUTO_CELLS // math.prod(scene.basis.shape[1:])) if scene.basis.size else 1
-        return max(1, min(wanted, affordable, MAX_OVERSAMPLE))
+        n_pixels = math.prod(scene.basis.shape[1:])
+        affordable = math.isqrt(MAX_AUTO_CELLS // n_pixels) if n_pixels else 1
+        wanted = max(1, min(wanted, affordable, MAX_OVERSAMPLE))
+        if wanted == 1:
+            return 1
+        return max(1, min(wanted, math.isqrt(MAX_AUTO_PADDING_CELLS // max(self._n_padding_pixels(scene), 1))))
+
+    def _n_padding_pixels(self, scene: SceneLike) -> int:
+        """Return the number of source pixels that transforms add around a scene, for the blur."""
+        from foveasim.optics._transform import source_pixels
+
+        grid, pitch_um = self.grid(scene), self.grid(scene).pitch_x_um
+        lambda_n_um, aperture = self._lambda_n_um(scene), self._aperture(scene.distance_m)
+        pad = self.padding_cells
+        if pad is None:
+            pixels = Grid.centred(grid.shape, pitch_um, grid.centre_um)
+            pad = self._reach_cells(scene, pixels, aperture, lambda_n_um, LOST_FRACTION)
+        return math.prod(source_pixels(n, self.padding, pad).size for n in grid.shape) - math.prod(grid.shape)
 
     def auto_oversample_error(self, scene: SceneLike) -> float:
         """
-        Return the expected error of photosites of side λN with automatic oversampling.
+        Return the expected error of photosites of side λN due to the cells of the map.
 
         Parameters
         ----------
@@ -456,7 +493,8 @@ class Optics(PointImages):
             pixels of 0.97 to 8 λN, and 300 sites each, against maps of 22 cells per λN. For points farther apart than λN it is
             the error for square pixels of the same size.
         """
-        cells = self.auto_oversample(scene) * self._pixels_per_lambda_n(scene)
+        n_cells = self.auto_oversample(scene) if self.oversample == "auto" else self.oversample
+        cells = n_cells * self._pixels_per_lambda_n(scene)
         return float(min(LARGEST_CELL_ERROR, CELL_ERROR * cells**CELL_ERROR_POWER))
 
     def _pixels_per_lambda_n(self, scene: SceneLike) -> float:
@@ -674,7 +712,7 @@ class Optics(PointImages):
             )
             weights = np.tile(weights, n_modes)
         tangent2_x, tangent2_y = self._squared_tangents(scene)
-        illumination = self._illumination(pixels, aperture)
+        illumination = self._illumination(pixels, aperture, scene.distance_m)
         if illumination is not None:
             tangent2_x, tangent2_y = np.zeros_like(tangent2_x), np.zeros_like(tangent2_y)
         # Cache key: a factor depends on these, the lens and the weights.
@@ -815,9 +853,10 @@ class Optics(PointImages):
         )
         if n_modes is None and found.displaced > self.field_tolerance:
             warn(
-                f"the PSF varies so much over the field that {found.n_modes} modes displace {found.displaced:.2g} of the "
-                f"light of a point, more than field_tolerance = {self.field_tolerance:g}; use a larger tolerance, or a "
-                "part of the picture",
+                f"the PSF varies so much over the field that {found.n_modes} modes, from its values at "
+                f"{found.at_points.shape[1]} x {found.at_points.shape[2]} points, displace {found.displaced:.2g} of the light "
+                f"of a point, more than field_tolerance = {self.field_tolerance:g}; more points would take too long: use a "
+                f"part of the picture, or accept it with field_tolerance={1.05 * found.displaced:.2g}",
                 SamplingWarning,
             )
         return found
@@ -921,17 +960,37 @@ class Optics(PointImages):
                 SamplingWarning,
             )
 
-    def _illumination(self, pixels: Grid, aperture: PSFModel) -> list[FieldWeight] | None:
+    def _illumination(self, pixels: Grid, aperture: PSFModel, distance_m: float) -> list[FieldWeight] | None:
         """Return the relative illumination of pixels: None for that of the emission, empty if 1."""
         from foveasim.optics._field_modes import field_points_um, field_weights
 
         points_um = field_points_um(pixels, ILLUMINATION_POINTS)
-        table = self.relative_illumination
+        table, degree = self.relative_illumination, 1
         values = aperture.illumination(points_um.reshape(-1, 2)) if table is None else table.at(points_um)
+        if values is None:
+            values, degree = self._cone_illumination(points_um, distance_m), 3
         if values is None:
             return None
         is_one = (np.abs(values - 1.0) <= ILLUMINATION_ROUNDING).all()
-        return [] if is_one else field_weights(values.reshape(1, *points_um.shape[:2]), pixels.shape, degree=1)
+        return [] if is_one else field_weights(values.reshape(1, *points_um.shape[:2]), pixels.shape, degree=degree)
+
+    def _cone_illumination(self, points_um: Floats, distance_m: float) -> Floats | None:
+        """Return the irradiance by the cones at points (..., 2) over that on the axis."""
+        height_um = np.hypot(points_um[..., 0], points_um[..., 1])
+        if self.exit_pupil_mm is not None:
+            tangent = height_um / float(um_from_m(m_from_mm(self.exit_pupil_mm)))
+        elif self.chief_ray is None:
+            return None
+        else:
+            within_um = np.minimum(height_um, self.chief_ray.image_height_um[-1]).reshape(-1, 1)
+            tangent = self.chief_ray.tangents(np.pad(within_um, ((0, 0), (0, 1))))[:, 0].reshape(height_um.shape)
+        radius = self._cone_radius(distance_m)
+        values = cone_irradiance_sr(tangent, radius) / cone_irradiance_sr(0.0, radius)
+        if self.emission == "isotropic":  # radiance increases with the field angle
+            values = values * np.hypot(
+                1.0, height_um / float(um_from_m(m_from_mm(self._image_distance_mm(distance_m))))
+            )
+        return np.asarray(values)
 
     def _squared_tangents(self, scene: SceneLike) -> tuple[Floats, Floats]:
         """Return (x0/H)² of the scene columns and (y0/H)² of the scene rows."""

@@ -35,11 +35,12 @@ from foveasim._core.calls import LENGTH, Declared, Limits
 from foveasim._core.extras import import_optional
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, Ints
+from foveasim._core.user_warnings import warn
+from foveasim._core.validation import Bools, Floats, Ints
 from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
-from foveasim.errors import FileError, GeometryError, ParameterError
-from foveasim.layout import Layout, inset
+from foveasim.errors import FileError, GeometryError, LayoutWarning, ParameterError
+from foveasim.layout import Layout, inset, node
 from foveasim.layout._regions import as_region
 from foveasim.layout.summary import hull_area_um2
 from foveasim.view.meshes import DEGENERATE_FRACTION, Mesh, extrude, import_pyvista, triangulate
@@ -61,6 +62,8 @@ QUARTER = (0.5, 0.5)
 TERRACES = (((0.39, 0.61), ("filters", "lenses")), ((0.27, 0.73), ("lenses",)))
 #: Overlaps below this fraction of the smaller part are rounding errors.
 OVERLAP_TOLERANCE = 1e-9
+#: Vertices of a union that are closer are one.
+UNION_ROUNDING_UM = 1e-5
 #: Upper limit of the thickness of a layer.
 MAX_THICKNESS_UM = 1000.0
 THICKNESS = replace(LENGTH, above=None, at_least=0.0, low=LENGTH.lowest, at_most=MAX_THICKNESS_UM)
@@ -172,6 +175,9 @@ class Solids:
     parts : mapping of str to Mesh
         ``"wells"``, ``"trenches"``, ``"filters"``, ``"lenses"``: those in the stack. The surface of every photosite is closed
         separately; those of neighbours touch.
+    sites_without_lens : tuple of int
+        Sites that cannot have a lens: with a hole, or not star-shaped about their centroid or the centre of their largest
+        inscribed circle.
 
     Examples
     --------
@@ -184,6 +190,7 @@ class Solids:
     layout: Layout
     sensor_stack: SensorStack
     parts: Mapping[str, Mesh]
+    sites_without_lens: tuple[int, ...] = ()
 
     def __repr__(self) -> str:
         return f"Solids({', '.join(f'{mesh.triangles.shape[0]:,} triangles of {name}' for name, mesh in self.parts.items())})"
@@ -313,7 +320,21 @@ class Solids:
         )
 
     def write(self, path: str | Path) -> None:
-        """Write the solids to a file; see :func:`foveasim.view.write_meshes`."""
+        """
+        Write the solids to a file; see :func:`foveasim.view.write_meshes`.
+
+        Raises
+        ------
+        GeometryError
+            When a part is not closed, or parts overlap, as :meth:`check` reports.
+        """
+        report = self.check()
+        if not report.ok:
+            open_parts = [part.name for part in report.parts if part.status != "NoError"]
+            problem = f"not closed: {', '.join(open_parts)}" if open_parts else "parts overlap"
+            raise GeometryError(
+                f"the solids cannot be written, {problem}; see Solids.check, and Layout.check with the rule 'max_overlap_um2'"
+            )
         write_meshes(self.meshes, path)
 
     def _part(self, name: str) -> Mesh:
@@ -343,10 +364,14 @@ def solids(
     Raises
     ------
     GeometryError
-        When a site is too narrow for its trench, or cannot have a lens because it has a hole or is not star-shaped about its
-        centroid or the centre of its largest inscribed circle; ``.site_ids`` lists the sites.
+        When a site is too narrow for its trench; ``.site_ids`` lists the sites.
     ParameterError
         When the column ``by`` does not exist.
+
+    Warns
+    -----
+    LayoutWarning
+        When sites cannot have a lens; ``sites_without_lens`` lists them.
 
     Examples
     --------
@@ -359,6 +384,10 @@ def solids(
     layout = data.layout if isinstance(data, Capture) else data
     if layout.n_sites == 0:
         raise GeometryError("the layout has no sites; solids need at least one")
+    if (
+        np.diff(layout.site_offsets).max() > 1
+    ):  # a vertex of a hole on an edge of its outline is a vertex of the edge, too
+        layout = node(layout)
     bare = np.zeros(layout.n_sites)
     in_silicon = _Colouring(_uniform_colour(layout, SILICON), bare)
     shown = None
@@ -386,9 +415,17 @@ def solids(
         parts["trenches"] = _prisms("trenches", walls, (-depth_um, 0.0), in_oxide, owner)
     if up_um > 0.0:
         parts["filters"] = _prisms("filters", layout, (0.0, up_um), in_filters)
+    without_lens = np.zeros(0, np.int64)
     if sensor_stack.lens_height_um > 0.0:
-        parts["lenses"] = _lenses(layout, up_um, sensor_stack, in_glass)
-    return Solids(layout=layout, sensor_stack=sensor_stack, parts=MappingProxyType(parts))
+        lenses, without_lens = _lenses(layout, up_um, sensor_stack, in_glass)
+        if lenses is not None:
+            parts["lenses"] = lenses
+    return Solids(
+        layout=layout,
+        sensor_stack=sensor_stack,
+        parts=MappingProxyType(parts),
+        sites_without_lens=tuple(without_lens.tolist()),
+    )
 
 
 def stack(
@@ -444,8 +481,8 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
     meshes : sequence of Mesh
     path : path
         ``.glb`` stores separate parts, with colours and the attributes ``_photosite`` and ``_value`` of every point; ``.3mf``
-        stores separate parts, and states micrometres; ``.ply`` and ``.obj`` store colours; ``.stl`` stores triangles only. The
-        unit is 1 µm; z points toward the lens.
+        stores separate parts, and states micrometres; ``.ply`` and ``.obj`` store colours; ``.stl`` stores triangles only,
+        without walls between bodies that touch, where all are closed. The unit is 1 µm; z points toward the lens.
 
     Raises
     ------
@@ -477,6 +514,9 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
     bodies = {mesh.name: _body(trimesh, mesh) for mesh in meshes if mesh.triangles.size}
     if not bodies:
         raise GeometryError("the solids have no triangles to write")
+    if kind == ".stl":
+        united = _united([mesh for mesh in meshes if mesh.triangles.size])
+        bodies = bodies if united is None else {"united": trimesh.Trimesh(*united, process=False)}
     scene = trimesh.Scene(bodies) if kind in (".glb", ".3mf") else trimesh.util.concatenate(list(bodies.values()))
     with atomic_write(target) as temporary, temporary.open("wb") as file:
         content = scene.export(file_type=kind[1:])
@@ -558,18 +598,33 @@ def _coloured_mesh(
     )
 
 
-def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, colouring: _Colouring) -> Mesh:
+def _lenses(
+    layout: Layout, floor_um: float, sensor_stack: SensorStack, colouring: _Colouring
+) -> tuple[Mesh | None, Ints]:
     """
-    Return lenses: spherical caps, stretched to the outlines of the sites.
+    Return lenses, if any, and the sites that cannot have one.
 
-    The outline shrinks toward the apex with increasing height.
+    Lenses are spherical caps, stretched to the outlines of the sites. The outline shrinks toward the apex with increasing
+    height.
     """
+    centre_um, can_have = _centres(layout)
+    without = np.flatnonzero(~can_have)
+    if without.size:
+        more = f" and {without.size - 1} more" if without.size > 1 else ""
+        warn(
+            f"site {without[0]}{more} cannot have a lens: it has a hole, or is not star-shaped; Solids.sites_without_lens "
+            "lists all",
+            LayoutWarning,
+        )
+    carrying = np.flatnonzero(can_have)
+    if carrying.size == 0:
+        return None, without
+    layout, centre_um = layout[carrying], centre_um[carrying]
     if sensor_stack.n_lens_corners:
         layout = _subdivide_edges(layout, sensor_stack.n_lens_corners)
     caps = triangulate(layout)
     n, n_sites, n_steps = layout.xy_um.shape[0], layout.n_sites, sensor_stack.n_lens_steps
-    site = np.repeat(np.arange(n_sites), np.diff(layout.ring_offsets[layout.site_offsets]))
-    centre_um = _centres(layout, site)
+    site = _site_of_vertex(layout)
     arm_um = layout.xy_um - centre_um[site]
     # Steps of equal angle from the rim (1) to the apex (0), where a fan closes the cap.
     fraction = np.cos(0.5 * np.pi * np.arange(n_steps) / n_steps)[:, np.newaxis]
@@ -595,9 +650,13 @@ def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, colourin
     top = n * (n_steps - 1)
     fan = np.stack((here + top, after + top, n_steps * n + site), axis=1)
     triangles = np.concatenate((caps.triangles[:, ::-1], *(part.reshape(-1, 3) for part in sides), fan))
-    photosite = np.concatenate((np.tile(site, n_steps), np.arange(n_sites)))
+    photosite = carrying[np.concatenate((np.tile(site, n_steps), np.arange(n_sites)))]
     mesh = _coloured_mesh("lenses", points_um, triangles.astype(np.int32), photosite.astype(np.int32), colouring)
-    return replace(mesh, is_smooth=True)
+    return replace(mesh, is_smooth=True), without
+
+
+def _site_of_vertex(layout: Layout) -> Ints:
+    return np.repeat(np.arange(layout.n_sites), np.diff(layout.ring_offsets[layout.site_offsets]))
 
 
 def _subdivide_edges(layout: Layout, n_corners: int) -> Layout:
@@ -637,27 +696,19 @@ def _cap_height_um(radius_um: Floats, height_um: float, fraction: Floats) -> Flo
     return np.where(fraction < 1.0, rise_um, 0.0)
 
 
-def _centres(layout: Layout, site: Ints) -> Floats:
+def _centres(layout: Layout) -> tuple[Floats, Bools]:
     """
-    Return a point in every site about which its outline is star-shaped, (n_site, 2) µm.
+    Return a point in every site, and whether its outline is star-shaped about it.
 
-    The point is the centroid, or the centre of the largest inscribed circle.
+    (n_site, 2) µm and (n_site,). The point is the centroid, or the centre of the largest inscribed circle.
     """
     has_hole = np.diff(layout.site_offsets) > 1
-    centre_um = layout.centroid_um.copy()
+    site, centre_um = _site_of_vertex(layout), layout.centroid_um.copy()
     off_centre = np.flatnonzero(~_is_star_shaped(layout, centre_um, site) & ~has_hole)
     if off_centre.size:
         circles = shapely.maximum_inscribed_circle(layout[off_centre].polygons())
         centre_um[off_centre] = shapely.get_coordinates(circles).reshape(-1, 2, 2)[:, 0]
-    bad = np.flatnonzero(~_is_star_shaped(layout, centre_um, site) | has_hole)
-    if bad.size:
-        more = f" (and {bad.size - 1} more)" if bad.size > 1 else ""
-        raise GeometryError(
-            f"site {bad[0]} cannot have a lens{more}: it has a hole, or is not star-shaped; use "
-            "lens_height_um=0, or other sites",
-            tuple(int(i) for i in bad),
-        )
-    return centre_um
+    return centre_um, _is_star_shaped(layout, centre_um, site) & ~has_hole
 
 
 def _is_star_shaped(layout: Layout, centre_um: Floats, site: Ints) -> NDArray[np.bool_]:
@@ -677,6 +728,25 @@ def _manifold(points_um: Floats, triangles: NDArray[np.integer[Any]]) -> Any:
     import manifold3d
 
     return manifold3d.Manifold(manifold3d.Mesh64(np.ascontiguousarray(points_um), triangles.astype(np.uint64)))
+
+
+def _united(meshes: Sequence[Mesh]) -> tuple[Floats, Ints] | None:
+    """
+    Return the points and triangles of the union of bodies, or None if one is open.
+
+    Files without connectivity merge equal points: walls between touching bodies would then have four triangles at an edge, and
+    no body would be closed.
+    """
+    import manifold3d
+
+    manifolds = [_manifold(mesh.points_um, mesh.triangles) for mesh in meshes]
+    if any(one.status() != manifold3d.Error.NoError for one in manifolds):
+        return None
+    bodies = [body for one in manifolds for body in one.decompose()]
+    union = manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add)
+    # Files of single precision would merge vertices that are closer.
+    found = union.simplify(UNION_ROUNDING_UM).to_mesh64()
+    return np.asarray(found.vert_properties)[:, :3], np.asarray(found.tri_verts, dtype=np.int64)
 
 
 def _overlap_in_height(one: Mesh, other: Mesh) -> bool:

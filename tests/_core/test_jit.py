@@ -95,6 +95,42 @@ def test_corrupt_machine_code_is_compiled_again(filled_cache, tmp_path, extensio
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("exchanged", [("nbc",), ("nbi",), ("nbi", "nbc")])
+def test_exchanged_machine_code_is_compiled_again(exchanged, tmp_path):
+    """Two kernels of equal types: numba loads the code of the other one if their files are exchanged."""
+    program = (
+        "import numpy as np\n"
+        "import exchanged\n"
+        "print(exchanged.double(np.ones(2)).tolist(), exchanged.triple(np.ones(2)).tolist())"
+    )
+    (tmp_path / "exchanged.py").write_text(
+        "from numba import types\n"
+        "from foveasim._core.jit import njit\n"
+        "floats = types.Array(types.float64, 1, 'C')\n"
+        "@njit(types.float64[::1](floats))\n"
+        "def double(x):\n    return 2.0 * x\n"
+        "@njit(types.float64[::1](floats))\n"
+        "def triple(x):\n    return 3.0 * x\n"
+    )
+    program = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n" + program
+    cache = tmp_path / "numba"
+    assert run(program, cache)[0] == "[2.0, 2.0] [3.0, 3.0]"
+    for extension in exchanged:
+        (one,), (other,) = (list(cache.rglob(f"*.{name}-*.{extension}")) for name in ("double", "triple"))
+        content = one.read_bytes(), other.read_bytes()
+        one.write_bytes(content[1])
+        other.write_bytes(content[0])
+
+    result, notice = run(program, cache)
+
+    assert result == "[2.0, 2.0] [3.0, 3.0]"
+    assert ("were corrupt: compiling them again" in notice) == (
+        exchanged != ("nbi", "nbc")
+    )  # a pair of pairs is complete
+    assert run(program, cache)[0] == "[2.0, 2.0] [3.0, 3.0]"
+
+
+@pytest.mark.slow
 def test_irreplaceable_machine_code_is_reported(filled_cache, tmp_path):
     result, message = load_kernels(with_irreplaceable_index(filled_cache, tmp_path))
 

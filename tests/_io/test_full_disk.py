@@ -72,7 +72,11 @@ def test_writers_report_reason_and_leave_nothing(tmp_path):
     pytest.importorskip("resource")
     (tmp_path / "out").mkdir()
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(tmp_path / "out")], capture_output=True, text=True, check=True
+        # Without bytecode: that of modules imported under the limit would be incomplete for all later programs.
+        [sys.executable, "-B", "-c", PROGRAM, str(tmp_path / "out")],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     found, left = json.loads(done.stdout.splitlines()[-1])
 

@@ -993,8 +993,10 @@ def test_processes_start_only_for_long_tasks(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
-def test_full_disk_leaves_no_corrupt_shard(name, tmp_path):
+def test_full_disk_leaves_no_corrupt_shard(name, tmp_path, monkeypatch):
     """A file size limit of the operating system simulates a full disk."""
+    # Bytecode of modules that are imported under the limit would be incomplete for all later programs.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     rng = np.random.default_rng(0)
     layout = {"generator": "grid", "parameters": {"n_x": 90, "n_y": 90, "pitch_um": 1.0}}
     data = explore.Dataset(

@@ -213,11 +213,33 @@ def test_fewer_modes_suffice_for_larger_tolerances():
     assert numbers[0] < numbers[-1] < 30
 
 
+@pytest.mark.slow(keep=2)
+@pytest.mark.parametrize("seed", range(30))
+def test_errors_fall_with_the_tolerance(seed, recwarn):
+    rng = np.random.default_rng(seed)
+    strength = 10.0 ** rng.uniform(-1.5, -0.2)
+    names = ("spherical_um", "coma_um", "astigmatism_um", "field_curvature_um")
+    paths_um = dict(zip(names, strength * rng.uniform(-1.0, 1.0, 4), strict=True))
+    seidel = Seidel(**paths_um, field_radius_um=float(rng.uniform(20.0, 60.0)))
+    lens = replace(LENS, seidel=seidel, f_number=float(rng.uniform(2.0, 8.0)))
+    blank = scene_of(np.zeros((24, 30)))
+    before = np.inf
+    for tolerance in (0.05, 0.02, 0.01, 0.005, 0.002):
+        recwarn.clear()
+        error = replace(lens, field_tolerance=tolerance).field_error(blank)
+
+        assert error <= 1.03 * before
+        assert error <= tolerance or "more points would take too long" in str(recwarn.pop(SamplingWarning).message)
+        before = error
+
+
 @pytest.mark.usefixtures("few_points")
 def test_unreachable_tolerance_causes_warning():
     strong = replace(LENS, seidel=Seidel(coma_um=0.2, astigmatism_um=0.4, field_radius_um=10.0))
     with pytest.warns(
-        SamplingWarning, match=r"modes displace 0\.\d+ of the light of a point, more than field_tolerance"
+        SamplingWarning,
+        match=r"modes, from its values at 5 x 5 points, displace 0\.\d+ of the light of a point, more than field_tolerance = "
+        r"0\.01; more points would take too long: use a part of the picture, or accept it with field_tolerance=0\.\d+",
     ):
         strong.power_map(noise(n=16))
 

@@ -182,7 +182,7 @@ def test_limited_auto_oversample_warns_with_error():
     optics = replace(OPTICS, source_pixel="square")
     sensor = sites_of(LAMBDA_N_UM, 40.0 * LAMBDA_N_UM)
     with pytest.warns(
-        SamplingWarning, match=r"16 x 16 cells .* since more would exceed its limits: .* errors up to 1\.9 %"
+        SamplingWarning, match=r"16 x 16 cells .* since more cells .* would exceed its limits: .* errors up to 1\.9 %"
     ):
         fs.Camera(optics=optics, sensor=sensor).photoelectrons_per_s(scene)
 

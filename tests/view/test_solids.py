@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import shapely
 
 import foveasim as fs
-from foveasim.errors import FileError, GeometryError, ParameterError
+from foveasim.errors import FileError, GeometryError, LayoutWarning, ParameterError
 from foveasim.view import SensorStack, render, solids, stack
 
 PARTS = ("wells", "trenches", "filters", "lenses")
@@ -214,16 +215,38 @@ def test_hole_touching_outline_gives_closed_solid():
     assert model.volumes_um3("wells")[0] == pytest.approx(3.0 * notched.area, rel=1e-9)
 
 
-def test_lens_on_non_star_shaped_site_raises():
+def test_sites_without_lens_are_listed():
     box = shapely.box(-9, 0, -1, 8)
-    with pytest.raises(
-        GeometryError, match=r"site 1 cannot have a lens: .* use lens_height_um=0, or other sites"
-    ) as raised:
-        solids(fs.Layout.from_polygons([box, HORSESHOE]), STACK)
-    assert raised.value.site_ids == (1,)
-    with pytest.raises(GeometryError, match=r"site 0 cannot have a lens \(and 1 more\): it has a hole"):
-        solids(fs.Layout.from_polygons([FRAME, box, HORSESHOE]), STACK)
-    assert solids(fs.Layout.from_polygons([FRAME, box, HORSESHOE]), NO_LENSES).check().ok
+    with pytest.warns(
+        LayoutWarning, match=r"site 0 and 1 more cannot have a lens: it has a hole, or is not star-shaped"
+    ):
+        model = solids(fs.Layout.from_polygons([FRAME, box, HORSESHOE]), STACK)
+    alone = solids(fs.Layout.from_polygons([box]), STACK)
+
+    assert model.sites_without_lens == (0, 2)
+    assert np.unique(model.parts["lenses"].photosite).tolist() == [1]
+    assert model.volumes_um3("lenses").tolist() == pytest.approx([0.0, alone.volumes_um3("lenses")[0], 0.0])
+    assert model.check().ok
+    with pytest.warns(LayoutWarning, match="site 0 cannot have a lens"):
+        assert "lenses" not in solids(fs.Layout.from_polygons([HORSESHOE]), STACK).parts
+
+
+def test_hole_on_edge_gives_closed_solid():
+    # The hole touches the lower edge in its middle, where the outline has no vertex.
+    site = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(4, 0), (6, 4), (2, 4)]])
+    model = solids(fs.Layout.from_polygons([site]), SensorStack(trench_width_um=0.0, lens_height_um=0.0))
+
+    assert model.check().ok
+    assert model.volumes_um3("wells")[0] == pytest.approx(3.0 * site.area, rel=1e-9)
+
+
+def test_open_solids_are_not_written(model, tmp_path):
+    wells = model.parts["wells"]
+    parts = {"wells": replace(wells, triangles=wells.triangles[1:])}
+
+    with pytest.raises(GeometryError, match="the solids cannot be written, not closed: wells"):
+        replace(model, parts=parts).write(tmp_path / "sensor.glb")
+    assert not list(tmp_path.iterdir())
 
 
 def test_hook_lens_uses_inscribed_circle():
@@ -405,7 +428,7 @@ def test_glb_file_preserves_faces_and_attributes(model, tmp_path):
         assert body.is_watertight
 
 
-@pytest.mark.parametrize("extension", [".stl", ".ply", ".obj", ".3mf"])
+@pytest.mark.parametrize("extension", [".ply", ".obj", ".3mf"])
 def test_other_files_preserve_faces_and_volume(model, extension, tmp_path):
     import trimesh
 
@@ -421,6 +444,18 @@ def test_other_files_preserve_faces_and_volume(model, extension, tmp_path):
         assert {body.units for body in bodies} <= {"micron", "microns", "um"}
         with zipfile.ZipFile(tmp_path / "sensor.3mf") as archive:
             assert b'unit="micron"' in archive.read("3D/3dmodel.model")
+
+
+@pytest.mark.parametrize("name", ["hexagons", "zones", "gaps"])
+def test_stl_of_touching_bodies_is_watertight(name, tmp_path):
+    import trimesh
+
+    model = solids(LAYOUTS[name](), STACK)
+    model.write(tmp_path / "sensor.stl")
+    loaded = trimesh.load(tmp_path / "sensor.stl")  # merges equal points
+
+    assert loaded.is_watertight
+    assert loaded.volume == pytest.approx(sum(model.volumes_um3(part).sum() for part in PARTS), rel=1e-5)
 
 
 def test_unknown_extension_raises_without_output(model, tmp_path):

@@ -16,8 +16,7 @@ MAX_STACK_SITES = 20_000
 #: Stacks with decreasing demands on the shape of photosites, and what they lack.
 STACKS = (
     (SensorStack(n_lens_steps=3), ""),
-    (SensorStack(lens_height_um=0.0), "no lenses: a photosite is not star-shaped"),
-    (SensorStack(lens_height_um=0.0, trench_width_um=0.0), "no trenches and lenses: a photosite is too narrow"),
+    (SensorStack(n_lens_steps=3, trench_width_um=0.0), "no trenches: a photosite is too narrow"),
 )
 
 
@@ -32,7 +31,9 @@ def solid(result: Simulated) -> PartData:
     shape = model.sensor_stack
     notes = [
         f"Silicon {shape.well_depth_um:g} µm, filters {shape.filter_thickness_um:g} µm",
-        f"lenses {shape.lens_height_um:g} µm" if "lenses" in model.parts else missing,
+        f"lenses {shape.lens_height_um:g} µm" if "lenses" in model.parts else "",
+        f"{len(model.sites_without_lens):,} photosites of shapes without lens" if model.sites_without_lens else "",
+        missing,
         f"{chosen.size:,} central photosites" if chosen.size < layout.n_sites else "",
     ]
     return {"bodies": bodies, "n_sites": layout.n_sites, "note": ", ".join(filter(None, notes))}, arrays

@@ -1,0 +1,98 @@
+"""Sentences of the documentation that a program can check: each is in its page, and true."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import foveasim as fs
+
+DOCS = Path(__file__).parents[1] / "docs"
+ZONES = fs.layout.zones(side_um=(64, 128), pitch_um=(4, 8))
+
+
+def states(page, sentence):
+    """Return whether a page contains a text, however its lines are broken."""
+    text = re.sub(r"\s+", " ", (DOCS / page).read_text())
+    return re.sub(r"\s+", " ", sentence) in text
+
+
+def uniform_capture(**electronics):
+    sensor = fs.Sensor(ZONES, shot_noise="off", bits=12, **electronics)
+    light = fs.PowerMap(np.full((1, 200, 200), 1e-3), fs.Grid.centred((200, 200), 1.0), [550.0])
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    return camera.capture(light, exposure_s="auto", seed=0)
+
+
+def spread(picture):
+    """Return the ratio of the largest to the smallest value."""
+    values = picture.data[np.isfinite(picture.data)]
+    return values.max() / values.min()
+
+
+def test_uniform_scene_gives_uniform_picture():
+    assert states(
+        "guides/pictures.md",
+        'A uniform scene gives a uniform picture of `"light_e"` per `"um2"`; codes of sites of several sizes are equal only if '
+        "their capacitances are in proportion to the areas",
+    )
+    fixed = uniform_capture(capacitance_f=1e-14)
+    proportional = uniform_capture(capacitance_f=1.6e-16 * ZONES.area_um2)
+
+    assert spread(fixed.picture(of="light_e", per="um2")) == pytest.approx(1.0, rel=0.02)
+    assert spread(fixed.picture(of="code")) > 3.0
+    assert spread(proportional.picture(of="code")) == pytest.approx(1.0, rel=0.02)
+
+
+def test_sites_saturate_at_the_same_irradiance():
+    assert states(
+        "questions.md",
+        "With a capacitance in proportion to the area, all sites saturate at the same irradiance: `capacitance_f=1.6e-16 * "
+        "layout.area_um2`",
+    )
+    full_e = 1.6e-16 * ZONES.area_um2 * fs.Sensor(ZONES).v_sat_v / 1.602176634e-19
+
+    assert np.ptp(full_e / ZONES.area_um2) < 1e-9 * full_e.max()
+
+
+def test_volumes_are_those_of_a_part():
+    assert states("guides/viewing.md", 'solids.volumes_um3("wells"), solids.fill_factor')
+    solids = fs.view.solids(ZONES, fs.view.SensorStack(well_depth_um=3.0, trench_width_um=0.0))
+
+    assert solids.volumes_um3("wells") == pytest.approx(3.0 * ZONES.area_um2)
+
+
+def test_region_results_list_all_measures():
+    assert states("guides/settings.md", "`fs.config.RegionResult` lists all measures")
+    with pytest.raises(fs.FoveasimError) as raised:
+        fs.config.RegionResult(measure="no such measure")
+    known = re.findall(r"'(\w+)'", str(raised.value))
+
+    assert all(
+        f"``{name}``" in fs.config.RegionResult.__doc__ or f'"{name}"' in fs.config.RegionResult.__doc__
+        for name in known[1:]
+    )
+
+
+def test_comparison_covers_common_pixels():
+    assert states(
+        "guides/comparing.md", "Only pixels that all cameras cover are compared, and the report states the coverage"
+    )
+    cameras = {
+        name: fs.Camera(
+            optics=fs.Optics(focal_length_mm=8.0, f_number=2.8),
+            sensor=fs.Sensor(layout, capacitance_f=1.6e-16 * layout.area_um2, bits=10),
+        )
+        for name, layout in {
+            "all": fs.layout.grid(20, 20, 8.0),
+            "hole": fs.layout.log_polar(n_sectors=24, r_min_um=20.0, r_max_um=80.0),
+        }.items()
+    }
+    rng = np.random.default_rng(0)
+    scene = fs.Scene.from_picture(rng.random((120, 120)), distance_m=1.0, fit="cover", illuminance_lux=500.0)
+    report = str(fs.compare.cameras(cameras, {"one": scene, "other": scene}, exposure_s=0.01, n_annuli=2, budget=None))
+
+    assert "coverage" in report
