@@ -326,7 +326,7 @@ class Camera:
         ParameterError
             For a power map and ``axis="sensor"``: its relative illumination cannot follow the gaze.
         """
-        gaze = np.array(self._gaze_um if gaze_um is None else gaze_um)
+        gaze = np.array(self._gaze_um) if gaze_um is None else np.array(check_point("gaze_um", gaze_um))
         if self._axis == "image" or not gaze.any():
             return self._with_pitch(light)
         if isinstance(light, PowerMap):

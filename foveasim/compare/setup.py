@@ -70,7 +70,7 @@ def photograph_scenes(
     optics: Optics | None = None,
     *,
     pictures: Sequence[str | Path] | Mapping[str, NDArray[np.uint8]] | None = None,
-    distance_m: float = DEFAULT_DISTANCE_M,
+    distance_m: Annotated[float, POSITIVE] = DEFAULT_DISTANCE_M,
     peak_radiance_w_m2_sr_nm: float = DEFAULT_RADIANCE_W_M2_SR_NM,
     wavelength_nm: Sequence[float] = (DEFAULT_WAVELENGTH_NM,),
     band_width_nm: float | Sequence[float] | None = DEFAULT_BAND_NM,

@@ -134,7 +134,7 @@ def read_calibration(
     path: str | Path,
     *,
     pixel_um: Annotated[float, POSITIVE],
-    focal_um: float | None = None,
+    focal_um: Annotated[float | None, POSITIVE] = None,
     image_size: tuple[int, int] | None = None,
 ) -> Lens:
     r"""

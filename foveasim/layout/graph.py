@@ -9,7 +9,7 @@ import numpy as np
 
 from foveasim._core.calls import Limits
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, Ints, read_only
+from foveasim._core.validation import Floats, Ints, check_point, read_only
 from foveasim.errors import ParameterError
 from foveasim.layout.model import Layout
 
@@ -104,6 +104,7 @@ def to_graph(
         begin = found[~is_own]
         end = np.repeat(np.arange(layout.n_sites), n_neighbours)
         length_um = np.asarray(shared[end, begin]).ravel()
+    centre_um = check_point("centre_um", centre_um)
     offset = local_offsets(position_um[begin] - position_um[end], position_um[end], scale_um[end], frame, centre_um)
     return SiteGraph(
         read_only(np.stack((begin, end))),

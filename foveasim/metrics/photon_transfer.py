@@ -32,6 +32,7 @@ from foveasim._core.validation import (
 from foveasim.errors import ParameterError, type_name
 from foveasim.sensor import Sensor
 from foveasim.sensor.adc import QUANTISATION_DN2
+from foveasim.sensor.limits import EXPOSURE, FRAMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -246,10 +247,10 @@ def draw_frames(
     sensor: Sensor,
     expected_e: ArrayLike,
     *,
-    n_frames: Annotated[int, Limits(at_least=1)] = 2,
+    n_frames: Annotated[int, FRAMES] = 2,
     seed: int,
     first_frame: Annotated[int, Limits(at_least=0)] = 0,
-    exposure_s: float | None = None,
+    exposure_s: Annotated[float | None, EXPOSURE] = None,
     n_threads: int | None = None,
 ) -> NDArray[Any]:
     """
@@ -342,7 +343,7 @@ def photon_transfer(
     if isinstance(source, Sensor):
         if expected_e is None or seed is None:
             raise ParameterError("expected_e" if expected_e is None else "seed", "must be given for a sensor")
-        sensor, n_frames = source, check_count("n_frames", n_frames, at_least=2)
+        sensor, n_frames = source, check_count("n_frames", n_frames, at_least=2, at_most=int(FRAMES.high))
         options: dict[str, Any] = {"seed": seed, "exposure_s": exposure_s, "n_threads": n_threads}
         frames = (
             draw_frames(sensor, level_e, n_frames=n_frames, first_frame=k * n_frames, **options)

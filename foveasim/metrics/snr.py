@@ -138,7 +138,7 @@ class SnrTable:
         )
 
 
-def size_classes_um(layout: Layout, n_classes: Annotated[int, Limits(at_least=1)] = 6) -> Floats:
+def size_classes_um(layout: Layout, n_classes: Annotated[int, Limits(at_least=1, at_most=1000)] = 6) -> Floats:
     """
     Assign each site to a size class, with logarithmically spaced class limits.
 

@@ -906,7 +906,8 @@ class Optics(PointImages):
 
     def cut_off_um(self, wavelength_nm: Floats | float, distance_m: float) -> Floats:
         """Return the period of the cut-off frequency: λN, or two samples of coarser PSFs."""
-        lambda_n_um = np.asarray(um_from_nm(wavelength_nm) * self.working_f_number(distance_m))
+        waves_nm = finite_array("wavelength_nm", wavelength_nm, above=0.0)
+        lambda_n_um = np.asarray(um_from_nm(waves_nm) * self.working_f_number(distance_m))
         return lambda_n_um if self.psfs is None else np.asarray(self.psfs.cut_off_um(lambda_n_um))
 
     def _field_points_um(self, grid: Grid) -> list[tuple[float, float]]:

@@ -19,7 +19,15 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.calls import Declared, Limits, check_declared
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, as_numbers, check_broadcast, finite_array, wavelengths_nm
+from foveasim._core.validation import (
+    Floats,
+    as_numbers,
+    check_broadcast,
+    check_count,
+    check_number,
+    finite_array,
+    wavelengths_nm,
+)
 from foveasim.errors import ParameterError
 from foveasim.units import um_from_nm
 
@@ -27,6 +35,8 @@ __all__ = ["LateralColour", "Seidel", "Zernike", "noll_to_nm", "osa_to_nm", "zer
 
 #: Highest index, of radial order 100; polynomials up to this order are accurate to 1e-12.
 MAX_INDEX = 5151
+#: Largest radial order: that of this index.
+MAX_ORDER = 100
 #: Largest wavefront error, µm or waves: 10 cm is beyond any lens.
 MAX_PATH = 1e5
 PATH = Limits(at_least=-MAX_PATH, at_most=MAX_PATH)
@@ -105,6 +115,7 @@ def zernike(n: int, m: int, x: ArrayLike, y: ArrayLike) -> Floats:
     """
     from scipy.special import eval_jacobi
 
+    check_count("n", n, at_least=0, at_most=MAX_ORDER)
     if n < abs(m) or (n - m) % 2:
         raise ParameterError("m", f"must be from -n to n = {n} in steps of two", m)
     x, y = as_numbers("x", x), as_numbers("y", y)
@@ -191,7 +202,7 @@ class Zernike:
 
     def coefficients_um(self, wavelength_nm: float) -> dict[tuple[int, int], float]:
         """Return the coefficients at a wavelength in µm, keyed by the orders (n, m)."""
-        own_um = float(um_from_nm(wavelength_nm))
+        own_um = float(um_from_nm(check_number("wavelength_nm", wavelength_nm)))
         table_nm = None if self.wavelength_nm is None else np.atleast_1d(np.asarray(self.wavelength_nm, np.float64))
         um = {}
         for j, value in self.coefficients.items():

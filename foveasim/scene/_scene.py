@@ -288,7 +288,8 @@ class Scene:
 
     def framed(self, pitch_um: float, axis_um: tuple[float, float] | None) -> Scene:
         """Return a scene with ``fit`` with its pitch and its optical axis."""
-        return self._with(pitch_um=PITCH.check("pitch_um", pitch_um), axis_um=axis_um)
+        axis = None if axis_um is None else check_point("axis_um", axis_um)
+        return self._with(pitch_um=PITCH.check("pitch_um", pitch_um), axis_um=axis)
 
     def with_centre(self, centre_um: tuple[float, float]) -> Scene:
         """

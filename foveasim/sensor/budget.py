@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 
 from foveasim._core.show import Drawn, drawn
-from foveasim._core.validation import Floats, as_numbers, check_per_site
+from foveasim._core.validation import Floats, check_per_site, finite_array
 from foveasim.sensor.effects import STANDARD
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.model.linearisation import DARK_SHOT, PHOTON_SHOT, QUANTISATION
@@ -124,7 +124,9 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: Annotated[fl
     >>> round(float(budget["photon_shot"].mean()), 2), round(float(budget["read"].mean()), 2)
     (31.62, 5.0)
     """
-    rates = check_per_site("photo_e_per_s", as_numbers("photo_e_per_s", photo_e_per_s), sensor.layout.n_sites)
+    rates = check_per_site(
+        "photo_e_per_s", finite_array("photo_e_per_s", photo_e_per_s, at_least=0.0), sensor.layout.n_sites
+    )
     known, of_devices = (
         sensor.linearise(photo_e_per_s=rates, exposure_s=exposure_s, is_device_known=is_known)
         for is_known in (True, False)

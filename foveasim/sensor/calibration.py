@@ -13,12 +13,12 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import FRACTION, POSITIVE, Limits, OwnCheck
-from foveasim._core.validation import Bools, Floats, as_numbers, check_number, check_per_site, finite_array, own_arrays
+from foveasim._core.calls import FRACTION, POSITIVE, OwnCheck
+from foveasim._core.validation import Bools, Floats, check_number, check_per_site, finite_array, own_arrays
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.adc import QUANTISATION_DN2, interpolate_codes
 from foveasim.sensor.effects import Photosites
-from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATIO
+from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, FRAMES, RATIO
 from foveasim.sensor.sensor import Sensor
 
 __all__ = ["Calibration", "calibrate", "linearise", "nominal_e_per_dn"]
@@ -304,7 +304,7 @@ class Calibration:
         SimulationError
             If no two sites of the layout are neighbours, or the dark signal of the exposure time is unknown.
         """
-        codes = check_per_site("code", as_numbers("code", code), self.n_sites, or_rows=True)
+        codes = check_per_site("code", finite_array("code", code), self.n_sites, or_rows=True)
         linear_dn = codes if self.linear_dn is None else interpolate_codes(codes, self.linear_dn)
         is_usable = np.broadcast_to(self.gain > 0.0, codes.shape)
         if self.highest_dn is not None:
@@ -357,7 +357,7 @@ def calibrate(
     *,
     exposure_s: Annotated[float, DURATION],
     flat_e: ArrayLike,
-    n_frames: Annotated[int, Limits(at_least=2)],
+    n_frames: Annotated[int, replace(FRAMES, at_least=2)],
     seed: int,
     long_exposure_s: Annotated[float | None, DURATION] = None,
     hot_sigmas: Annotated[float, RATIO] = 6.0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -113,7 +114,7 @@ class Nonlinearity(_Deterministic):
 @dataclass(eq=False)
 class ChargeCheck(_Deterministic):
     """
-    Check that charges are at least a limit, in e-, and not NaN.
+    Check that charges are finite, and at least a limit, in e-.
 
     Raises ParameterError with the name of the charges and the smallest one of the block.
     """
@@ -125,6 +126,8 @@ class ChargeCheck(_Deterministic):
         """Return the values unchanged."""
         if values.size and not (smallest := float(np.min(values))) >= self.at_least:
             raise ParameterError(self.parameter, f"must be >= {self.at_least:g} everywhere", smallest, "e-")
+        if values.size and not math.isfinite(largest := float(np.max(values))):
+            raise ParameterError(self.parameter, "must be finite everywhere", largest, "e-")
         return values
 
 

@@ -33,5 +33,7 @@ TEMPERATURE = Limits(above=0.0, low=0.01, at_most=1000.0, hint="temperatures are
 VOLTS = Limits(at_least=0.0, at_most=1e3, hint="voltages are in volts: 1 mV is 1e-3")
 EXPOSURE = Limits(at_least=0.0, low=1e-12, at_most=1e7, hint=_SECONDS)
 DURATION = Limits(above=0.0, low=1e-12, at_most=1e7, hint=_SECONDS)
+#: Frames that are simulated or averaged.
+FRAMES = Limits(at_least=1, at_most=10_000_000)
 #: Thresholds in standard deviations, and ratios of them.
 RATIO = Limits(above=0.0, at_most=1e6, hint="a number of standard deviations")

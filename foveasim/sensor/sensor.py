@@ -16,7 +16,17 @@ from foveasim._core.provenance import is_digest, large_arrays, resolve
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_per_site, finite_array, read_only, unmasked
+from foveasim._core.validation import (
+    Bools,
+    Floats,
+    Ints,
+    as_numbers,
+    check_per_site,
+    finite_array,
+    read_only,
+    unmasked,
+    wavelengths_nm,
+)
 from foveasim.errors import ParameterError, SimulationError, format_value, type_name
 from foveasim.incidence import ChiefRayTable
 from foveasim.sensor.adc import ADC, BITS, DNL, INL, LOG_STRENGTH, Companding, ConversionTables
@@ -442,7 +452,7 @@ class Sensor:
 
     def filter_transmission(self, wavelength_nm: Floats) -> Floats:
         """Compute filter transmissions without quantum efficiency, (n_filter, n_wavelength)."""
-        return self._filter_set.transmission(wavelength_nm)
+        return self._filter_set.transmission(wavelengths_nm("wavelength_nm", wavelength_nm))
 
     def responsivity_e_per_j(self, wavelength_nm: Floats) -> Floats:
         """
@@ -467,6 +477,7 @@ class Sensor:
         known: tuple[Floats, Floats] | None = self.__dict__.get("_responsivity")
         if known is not None and np.array_equal(known[0], wavelength_nm):
             return known[1]
+        wavelength_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
         curves = self._transmission(wavelength_nm)
         if not (np.isfinite(curves).all() and curves.min() >= 0.0 and curves.max() <= 1.0):
             raise ParameterError("qe", "and 'filters' must have values from 0 to 1 at every wavelength", curves)
@@ -847,7 +858,7 @@ class Sensor:
         *,
         seed: int | None = None,
         frame: int = 0,
-        exposure_s: float | None = None,
+        exposure_s: Annotated[float | None, EXPOSURE] = None,
         n_threads: int | None = None,
         _streams: Streams | None = None,
     ) -> Ints:

@@ -44,7 +44,7 @@ layout:
   generator: log_polar
   parameters: {n_sectors: 48, min_size_um: 8.0, r_max_um: 690.0, stagger: true, chords_per_arc: 2}
   mosaic: [RG, GB]
-  rules: {min_size_um: 8.0, min_width_um: 7.0}
+  rules: {min_size_um: 8.0, min_width_um: 7.0, angle_limit_deg: 60.0}
 sensor:
   qe: {kind: silicon, depth_um: 3.0}
   filters: rgb

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from foveasim._core.calls import Limits
+from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Declared, Limits
 from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset, Sites, Stage
 from foveasim.sensor.limits import SHARE, TEMPERATURE
@@ -96,7 +96,7 @@ def _log_carriers(temperature_k: float) -> float:
 
 
 @dataclass(frozen=True)
-class DarkSignal(FixedFactor):
+class DarkSignal(Declared, FixedFactor):
     """
     Dark-signal non-uniformity (DSNU): log-normal factors of mean 1 on the dark current.
 
@@ -111,7 +111,7 @@ class DarkSignal(FixedFactor):
     stage: ClassVar[Stage] = "dark"
     needs_layout: ClassVar[bool] = False
 
-    dsnu_fraction: float
+    dsnu_fraction: Annotated[float, NOT_NEGATIVE]
 
     def pattern(self, sites: Sites) -> Floats:
         """Return the factors, (n,)."""
@@ -123,7 +123,7 @@ class DarkSignal(FixedFactor):
 
 
 @dataclass(frozen=True)
-class HotSites(FixedOffset):
+class HotSites(Declared, FixedOffset):
     """
     Hot sites: sites with additional dark current.
 
@@ -141,8 +141,8 @@ class HotSites(FixedOffset):
     is_defect: ClassVar[bool] = True
     needs_layout: ClassVar[bool] = False
 
-    hot_fraction: float
-    hot_e_per_s: float
+    hot_fraction: Annotated[float, FRACTION]
+    hot_e_per_s: Annotated[float, NOT_NEGATIVE]
 
     def pattern(self, sites: Sites) -> Floats:
         """Return the additional dark current, (n,) e-/s."""

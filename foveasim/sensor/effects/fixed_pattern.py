@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
+from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Declared
 from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset, Sites, Stage
 
@@ -15,12 +16,12 @@ __all__ = ["ColumnOffset", "DeadSites", "PhotoResponse", "PixelGain", "PixelOffs
 
 
 @dataclass(frozen=True)
-class _GaussianFactor(FixedFactor):
+class _GaussianFactor(Declared, FixedFactor):
     """Gaussian factors of mean 1, clipped at 0, of the standard deviation ``fraction``."""
 
     needs_layout: ClassVar[bool] = False
 
-    fraction: float
+    fraction: Annotated[float, NOT_NEGATIVE]
 
     def pattern(self, sites: Sites) -> Floats:
         """Return the factors, (n,)."""
@@ -62,7 +63,7 @@ class PixelGain(_GaussianFactor):
 
 
 @dataclass(frozen=True)
-class DeadSites(FixedFactor):
+class DeadSites(Declared, FixedFactor):
     """
     Dead sites: sites without photo response.
 
@@ -78,7 +79,7 @@ class DeadSites(FixedFactor):
     is_defect: ClassVar[bool] = True
     needs_layout: ClassVar[bool] = False
 
-    fraction: float
+    fraction: Annotated[float, FRACTION]
 
     def pattern(self, sites: Sites) -> Floats:
         """Return 0 for dead sites and 1 for others, (n,)."""
@@ -90,7 +91,7 @@ class DeadSites(FixedFactor):
 
 
 @dataclass(frozen=True)
-class PixelOffset(FixedOffset):
+class PixelOffset(Declared, FixedOffset):
     """
     Pixel FPN: Gaussian offsets, which correlated double sampling removes.
 
@@ -105,7 +106,7 @@ class PixelOffset(FixedOffset):
     stage: ClassVar[Stage] = "output"
     needs_layout: ClassVar[bool] = False
 
-    offset_v: float
+    offset_v: Annotated[float, NOT_NEGATIVE]
 
     def pattern(self, sites: Sites) -> Floats:
         """Return the offsets, (n,) V."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import Annotated, Any, ClassVar, cast
 
 import numpy as np
 
+from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Declared
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import AdditiveNoise, Sites, Stage
@@ -18,7 +19,7 @@ __all__ = ["ReadNoise", "ResetNoise", "TelegraphNoise"]
 
 
 @dataclass(frozen=True)
-class ResetNoise(AdditiveNoise):
+class ResetNoise(Declared, AdditiveNoise):
     """
     Reset (kTC) noise: thermal noise of the reset switch, stored on the sense node.
 
@@ -33,7 +34,7 @@ class ResetNoise(AdditiveNoise):
     is_drawn_at_reset: ClassVar[bool] = True
     needs_layout: ClassVar[bool] = False
 
-    temperature_k: float
+    temperature_k: Annotated[float, NOT_NEGATIVE]
 
     def deviation(self, sites: Sites) -> Floats:
         """Return ``sqrt(k T C) / q``, (n,) or (1,) e-."""
@@ -41,7 +42,7 @@ class ResetNoise(AdditiveNoise):
 
 
 @dataclass(frozen=True, eq=False)
-class ReadNoise(AdditiveNoise):
+class ReadNoise(Declared, AdditiveNoise):
     """
     Gaussian read noise.
 
@@ -64,7 +65,7 @@ class ReadNoise(AdditiveNoise):
     stage: ClassVar[Stage] = "charge"
     needs_layout: ClassVar[bool] = False
 
-    read_noise_e: float | Floats
+    read_noise_e: Annotated[float | Floats, NOT_NEGATIVE]
 
     __repr__ = short_repr
 
@@ -74,7 +75,7 @@ class ReadNoise(AdditiveNoise):
 
 
 @dataclass(frozen=True)
-class TelegraphNoise(AdditiveNoise):
+class TelegraphNoise(Declared, AdditiveNoise):
     """
     Random telegraph signal (RTS) noise: two equally probable states on some sites.
 
@@ -98,8 +99,8 @@ class TelegraphNoise(AdditiveNoise):
     is_defect: ClassVar[bool] = True
     needs_layout: ClassVar[bool] = False
 
-    rts_fraction: float
-    rts_e: float
+    rts_fraction: Annotated[float, FRACTION]
+    rts_e: Annotated[float, NOT_NEGATIVE]
 
     def deviation(self, sites: Sites) -> float | Floats:
         """

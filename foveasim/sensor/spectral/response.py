@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats
+from foveasim._core.validation import Floats, finite_array
 from foveasim.errors import ParameterError
 from foveasim.sensor.spectral.curves import (
     BandMean,
@@ -96,7 +96,8 @@ class FilterSet:
         ParameterError
             If a curve raises (its exception is the cause), or does not return one number per wavelength.
         """
-        return np.stack([curve_values(curve, wavelength_nm) for curve in self.curves])
+        waves_nm = finite_array("wavelength_nm", wavelength_nm)
+        return np.stack([curve_values(curve, waves_nm) for curve in self.curves])
 
 
 def rgb_filters() -> FilterSet:

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
+from foveasim._core.calls import Limits
 from foveasim.view._ipython import ipython_shell
 
 if TYPE_CHECKING:
@@ -24,6 +25,9 @@ __all__ = ["hidden_figures", "new_axes", "new_figure"]
 
 #: Smallest ratio of a figure's shorter side to its longer one, which leaves space for axes, labels and colour bars.
 MIN_ASPECT_RATIO = 0.4
+
+#: Sides of figures, inches: of at least one letter, and of less than a wall.
+FIGURE_INCHES = Limits(above=0.0, low=0.1, at_most=200.0)
 
 _is_hidden: ContextVar[bool] = ContextVar("_is_hidden", default=False)
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.calls import POSITIVE
 from foveasim._core.validation import Floats, check_count
 from foveasim._io.mapped_files import in_memory
 from foveasim.errors import ParameterError
@@ -15,7 +16,7 @@ from foveasim.reconstruct import CorticalImage, Picture
 from foveasim.scene import Scene
 from foveasim.sensor import rgb_filters
 from foveasim.units import encode_srgb
-from foveasim.view.plots.figures import new_axes
+from foveasim.view.plots.figures import FIGURE_INCHES, new_axes
 from foveasim.view.site_colours import BACKGROUND, as_fractions
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ RADIUS_LABELS = 7
 LENGTH_UNITS = (("µm", 1.0), ("mm", 1e3), ("m", 1e6), ("km", 1e9))
 
 
-def plot_scene(scene: Scene, *, ax: Axes | None = None, figure_inches: float = 8.0) -> Axes:
+def plot_scene(scene: Scene, *, ax: Axes | None = None, figure_inches: Annotated[float, FIGURE_INCHES] = 8.0) -> Axes:
     """
     Draw a scene in approximate colours.
 
@@ -83,7 +84,11 @@ def plot_scene(scene: Scene, *, ax: Axes | None = None, figure_inches: float = 8
 
 
 def plot_power_map(
-    power_map: PowerMap, band: int | None = None, *, ax: Axes | None = None, figure_inches: float = 8.0
+    power_map: PowerMap,
+    band: int | None = None,
+    *,
+    ax: Axes | None = None,
+    figure_inches: Annotated[float, FIGURE_INCHES] = 8.0,
 ) -> Axes:
     """
     Draw the irradiance of a power map.
@@ -128,12 +133,12 @@ def plot_power_map(
 
 def plot_picture(
     picture: Picture,
-    white: float | Floats | None = None,
+    white: Annotated[float | Floats | None, POSITIVE] = None,
     *,
     encode_srgb: bool = True,
     channel: int | None = None,
     ax: Axes | None = None,
-    figure_inches: float = 8.0,
+    figure_inches: Annotated[float, FIGURE_INCHES] = 8.0,
 ) -> Axes:
     """
     Draw a picture.
@@ -193,7 +198,7 @@ def plot_image(
     colour_map: str = "viridis",
     ratio: float | None = None,
     ax: Axes | None = None,
-    figure_inches: float = 8.0,
+    figure_inches: Annotated[float, FIGURE_INCHES] = 8.0,
 ) -> Axes:
     """
     Draw an array as an image with labelled axes.
@@ -242,7 +247,11 @@ def plot_image(
 
 
 def plot_cortical(
-    image: CorticalImage, channel: int | None = None, *, ax: Axes | None = None, figure_inches: float = 8.0
+    image: CorticalImage,
+    channel: int | None = None,
+    *,
+    ax: Axes | None = None,
+    figure_inches: Annotated[float, FIGURE_INCHES] = 8.0,
 ) -> Axes:
     """
     Draw a log-polar image: angles along x, rings along y, the innermost ring at the bottom.

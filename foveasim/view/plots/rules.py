@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import shapely
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.layout.drc.rules import Report, RuleResult
-from foveasim.view.plots.figures import new_axes
+from foveasim.view.plots.figures import FIGURE_INCHES, new_axes
 from foveasim.view.plots.sites import plot_layout
 
 if TYPE_CHECKING:
@@ -35,7 +35,11 @@ MARGIN_FRACTION = 0.1
 
 
 def plot_report(
-    report: Report, layout: Layout | None = None, *, ax: Axes | None = None, figure_inches: float = 8.0
+    report: Report,
+    layout: Layout | None = None,
+    *,
+    ax: Axes | None = None,
+    figure_inches: Annotated[float, FIGURE_INCHES] = 8.0,
 ) -> Axes:
     """
     Draw the design rule violations of a layout.

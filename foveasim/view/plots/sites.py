@@ -6,7 +6,7 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,7 @@ from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout, readout_order
 from foveasim.view.id_map import site_at
-from foveasim.view.plots.figures import new_axes
+from foveasim.view.plots.figures import FIGURE_INCHES, new_axes
 from foveasim.view.site_colours import BACKGROUND, BOUNDARY, CATEGORY_COLOURS, SiteColours, as_fractions, colours_of
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def plot_layout(
     scale_bar: bool = True,
     legend: bool = True,
     ax: Axes | None = None,
-    figure_inches: float = 8.0,
+    figure_inches: Annotated[float, FIGURE_INCHES] = 8.0,
 ) -> Axes:
     """
     Draw photosites, filled by a value or a colour.
@@ -120,7 +120,7 @@ def plot_capture(
     scale_bar: bool = True,
     legend: bool = True,
     ax: Axes | None = None,
-    figure_inches: float = 8.0,
+    figure_inches: Annotated[float, FIGURE_INCHES] = 8.0,
 ) -> Axes:
     """
     Draw the photosites of a capture, coloured by their measured values.
