@@ -192,14 +192,31 @@ def test_wrong_exposure_warns_once(exposure_s, message):
     assert re.match(message, str(found.message))
 
 
-def test_right_exposures_and_charts_do_not_warn():
+def chart_of(**light):
+    return fs.Scene.flat(shape=(200, 200), pitch_um=100.0, distance_m=1.0, band_width_nm=50.0, **light)
+
+
+def test_right_exposures_do_not_warn():
     camera = camera_of()
-    flat = fs.Scene.flat(shape=(200, 200), pitch_um=100.0, distance_m=1.0, illuminance_lux=1e6, band_width_nm=50.0)
+    dark = chart_of(radiance_w_m2_sr_nm=0.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         camera.capture(photograph(), exposure_s="auto", seed=0)
-        camera.capture(flat, exposure_s=10.0, seed=0)
+        camera.capture(chart_of(illuminance_lux=1e6), exposure_s="auto", seed=0)
+        camera.capture(dark, exposure_s=1.0, seed=0)  # a dark frame
         camera.capture(photograph(), exposure_s=0.0, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("exposure_s", "problem"),
+    [
+        (1e-9, "all photosites receive less than one electron or one code"),
+        (10.0, "100 % of the photosites are saturated"),
+    ],
+)
+def test_charts_without_signal_or_contrast_warn(exposure_s, problem):
+    with pytest.warns(ExposureWarning, match=f"{problem} at an exposure of .* use exposure_s="):
+        camera_of().capture(chart_of(illuminance_lux=1e3), exposure_s=exposure_s, seed=0)
 
 
 def test_pixels_wider_than_photosites_warn_once():

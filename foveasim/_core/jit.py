@@ -331,8 +331,9 @@ def _is_cached(function: Callable[..., Any]) -> bool:
 def _directory_of_other_code(compiled: Any, function: Callable[..., Any]) -> Path | None:
     """Return the cache directory if it has the code of another function, else None."""
     wanted = function.__module__, function.__qualname__
-    names = {(found.fndesc.modname, found.fndesc.qualname) for found in compiled.overloads.values()}
-    return None if names == {wanted} else Path(compiled._cache.cache_path)  # noqa: SLF001 -- no public name
+    overloads = getattr(compiled, "overloads", {})  # none where compilation is disabled
+    names = {(found.fndesc.modname, found.fndesc.qualname) for found in overloads.values()}
+    return None if names <= {wanted} else Path(compiled._cache.cache_path)  # noqa: SLF001 -- no public name
 
 
 def _find_cache_directory(error: BaseException | None) -> Path | None:

@@ -37,7 +37,7 @@ def starting_file(kind: str) -> str:
     >>> print(*fs.config.starting_file("rules").splitlines()[4:7], sep="\n")
     min_size_um: 4.0                     # µm, square root of the area of a photosite
     min_width_um: 3.0                    # µm, between facing edges of a photosite
-    max_aspect_ratio: 2.0                # longer over shorter side of the rectangle around a photosite
+    angle_limit_deg: 25.0                # facing edges converge by less; 90 as in KLayout, which rejects annular photosites
     """
     check_choice("kind", kind, STARTING_FILES)
     text = (files("foveasim.config") / "starting_files" / f"{kind}.yaml").read_text(encoding="utf-8")

@@ -44,5 +44,5 @@ def test_narrow_photosites_have_no_trenches(settings):
     }
     about, _ = PARTS["solid"].make(Engine(n_threads=1).simulate(settings))
 
-    assert [body["name"] for body in about["bodies"]["list"]] == ["wells", "filters"]
+    assert [body["name"] for body in about["bodies"]["list"]] == ["wells", "filters", "lenses"]
     assert "no trenches" in about["note"]

@@ -296,7 +296,7 @@ export class Editor {
       return Number((Math.floor(value / unit + 1e-9) * unit).toPrecision(2));
     };
     this.studio.send("layout.rules", { min_size_um: floor(smallest), min_width_um: floor(WIDTH_FRACTION * smallest),
-      angle_limit_deg: 60, max_overlap_um2: 0 }, true);
+      angle_limit_deg: 25, max_overlap_um2: 0 }, true);
     this.studio.showRules();
   }
 
