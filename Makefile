@@ -10,10 +10,7 @@ INSTALL := -m pip install --quiet --no-compile
 PYTEST_ARGS ?=
 # Bytecode is stored next to the sources, even where the environment disables it: each process would compile the package and its tests.
 unexport PYTHONDONTWRITEBYTECODE
-# Processes take half of each other's remaining tests: they finish at the same time, and most files run in one process.
-# One process more than cores: tests that wait for other programs leave a core idle. At most 4, of some 2 GB each.
-PROCESSES := $(shell $(PYTHON) -c 'import os; print(min(4, 1 + (os.cpu_count() or 1)))' 2>/dev/null || echo 2)
-PARALLEL := --numprocesses $(PROCESSES) --dist worksteal
+PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 
 # Lower bounds of pyproject.toml on the oldest Python: .venv-lowest/uv resolves them, .venv-lowest/env contains them.
 LOWEST := .venv-lowest

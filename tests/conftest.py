@@ -1,5 +1,5 @@
 """
-Selection of tests, their requirements and kernels.
+Selection of tests, their requirements, kernels, and distribution to processes.
 
 The default run leaves out tests marked ``slow`` and tests in a browser, except for those that ``slow(keep=...)`` selects: a
 number of parameter sets of each function, spread evenly, or parts of their names; its random tests have a third of the
@@ -16,6 +16,7 @@ import sys
 from collections import defaultdict
 from functools import cache, partial
 from importlib.util import find_spec
+from pathlib import Path
 
 import hypothesis
 import pytest
@@ -57,6 +58,16 @@ MISSING = {
 
 
 collect_ignore_glob = [] if find_spec("torch") else ["learn/*"]
+
+#: Files with slow tests that share no fixture: each of their tests may run in any process, after all other files, so that the
+#: processes finish at about the same time.
+INDEPENDENT = {
+    "test_gallery.py",
+    "test_docs.py",
+    "test_cli_explore.py",
+    "test_principal_point.py",
+    "test_invariants.py",
+}
 
 
 def pytest_configure(config):
@@ -122,6 +133,19 @@ def pytest_collection_modifyitems(config, items):
         dropped.update(set(sets) - kept)
     config.hook.pytest_deselected(items=list(dropped))
     items[:] = [item for item in items if item not in dropped]
+
+
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
+def pytest_xdist_make_scheduler(config, log):
+    """Run the tests of a file in one process, except for those of ``INDEPENDENT``."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            file = nodeid.partition("::")[0]
+            return nodeid if Path(file).name in INDEPENDENT else file
+
+    return ByFile(config, log)
 
 
 def pytest_runtest_setup(item):

@@ -147,7 +147,7 @@ def disagreements(kind, seed, n, rule, check, angle_deg=90.0):
     return wrong, n_flagged
 
 
-@pytest.mark.slow(keep=6)
+@pytest.mark.slow(keep=3)
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("angle_deg", [90.0, 50.0])
 @pytest.mark.parametrize(("rule", "check"), [("min_width_um", "width_check"), ("min_space_um", "notch_check")])
