@@ -745,7 +745,7 @@ def _united(meshes: Sequence[Mesh]) -> tuple[Floats, Ints] | None:
     bodies = [body for one in manifolds for body in one.decompose()]
     union = manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add)
     # Files of single precision would merge vertices that are closer.
-    found = union.simplify(UNION_ROUNDING_UM).to_mesh64()
+    found = union.set_tolerance(UNION_ROUNDING_UM).to_mesh64()
     return np.asarray(found.vert_properties)[:, :3], np.asarray(found.tri_verts, dtype=np.int64)
 
 
