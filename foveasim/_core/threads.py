@@ -131,8 +131,8 @@ def _limit_heaps() -> None:
     """
     Limit the number of heaps (arenas) of the C library of GNU, unless the environment does.
 
-    By default each thread has its own one, and retains parts of pages between used blocks: in some hundred different captures
-    the memory of a process doubles.
+    By default each thread has its own one, and retains parts of pages between used blocks. After 300 captures of different
+    cameras and pictures with two cores, a process had 1031 MB with the default, and 806 MB with two heaps.
     """
     if sys.platform.startswith("linux") and not {"MALLOC_ARENA_MAX", "GLIBC_TUNABLES"} & os.environ.keys():
         with suppress(AttributeError, OSError):  # other C libraries

@@ -87,7 +87,8 @@ def _point_to_edge(px, py, ax, ay, bx, by):
     t = 0.0
     if length2 > 0.0:
         t = min(max(((px - ax) * dx + (py - ay) * dy) / length2, 0.0), 1.0)
-    return np.hypot(px - ax - t * dx, py - ay - t * dy)
+    x, y = px - ax - t * dx, py - ay - t * dy
+    return np.sqrt(x * x + y * y)  # faster than hypot, and far from overflow
 
 
 @njit()
@@ -153,7 +154,7 @@ def facing_distances(xy, after, first_vertex, side, min_cosine, reach):
                     or max(cy, dy) <= low
                 ):
                     continue
-                if min_cosine > 0.0 and opposed <= min_cosine * np.hypot(ex, ey) * np.hypot(fx, fy):
+                if opposed * opposed <= min_cosine * min_cosine * (ex * ex + ey * ey) * (fx * fx + fy * fy):
                     continue
                 near = _distance_inwards(ax, ay, bx, by, cx, cy, dx, dy)
                 if near < smallest:

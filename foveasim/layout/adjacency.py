@@ -14,7 +14,7 @@ from foveasim.layout.model import Layout
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-__all__ = ["TOUCHING_UM", "adjacency"]
+__all__ = ["TOUCHING_UM", "adjacency", "colours_of_boxes", "near_boxes"]
 
 #: Distance within which edges touch: far below any manufacturing grid, far above the rounding of coordinates.
 TOUCHING_UM = 1e-6
@@ -88,3 +88,23 @@ def near_boxes(box_um: Floats, reach_um: float | Floats) -> tuple[Ints, Ints]:
     pairs = _kernels.intersecting_boxes(grown_um, np.argsort(grown_um[:, 0]))
     first, second = np.divmod(np.sort(pairs), max(box_um.shape[0], 1))
     return first, second
+
+
+def colours_of_boxes(box_um: Floats) -> Ints:
+    """
+    Return small integers (n,) for boxes (n, 4): different ones where boxes touch.
+
+    At most 64, the number of the kernel; more boxes at one place share some.
+    """
+    from foveasim.layout import _kernels
+
+    n_boxes = box_um.shape[0]
+    one, other = near_boxes(box_um, TOUCHING_UM)
+    first, second = np.concatenate((one, other)), np.concatenate((other, one))
+    order = np.argsort(first, kind="stable")
+    starts = np.concatenate(([0], np.cumsum(np.bincount(first, minlength=n_boxes)))).astype(np.int64)
+    for n_colours in (4, 8, 16, 32, 64):
+        colour: Ints = _kernels.colour_greedily(starts, second[order], np.ones(order.size), n_colours)
+        if (colour[one] != colour[other]).all():
+            break
+    return colour

@@ -844,6 +844,8 @@ def without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:
     if ring_offsets.size == 1:
         return xy_um, ring_offsets
     is_new = (xy_um != xy_um[next_vertex(ring_offsets)]).any(axis=1)
+    if is_new.all():
+        return xy_um, ring_offsets
     n_left = np.add.reduceat(is_new.astype(np.int64), ring_offsets[:-1])
     return xy_um[is_new], np.concatenate(([0], np.cumsum(n_left)))
 

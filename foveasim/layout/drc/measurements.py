@@ -37,8 +37,8 @@ SMALL_SELECTION_RATIO = 10
 SLIVER_WIDTH = 0.36
 #: Angles within this difference of their cosines are not below a limit.
 ANGLE_ROUNDING = 1e-10
-#: Pairs or sites per task of a thread.
-PAIRS_PER_TASK = 100_000
+#: Pairs, and sites, per task of a thread.
+PAIRS_PER_TASK, SITES_PER_TASK = 100_000, 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +171,7 @@ class Case:
                 reach_um, LENGTH_ROUNDING_UM, is_shared,
             )  # fmt: skip
 
-        found = parallel_map(find_contacts, _task_slices(first.size), thread_count())
+        found = parallel_map(find_contacts, _task_slices(first.size, PAIRS_PER_TASK), thread_count())
         distance_um, is_non_overlapping = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return Contacts(first, second, distance_um, is_non_overlapping, is_shared)
 
@@ -204,9 +204,9 @@ class Case:
         return low, low + sides_um, np.maximum(filled_um2, 0.0)
 
 
-def _task_slices(n: int) -> list[slice]:
-    """Return slices of pairs for several threads."""
-    return [slice(start, start + PAIRS_PER_TASK) for start in range(0, max(n, 1), PAIRS_PER_TASK)]
+def _task_slices(n: int, per_task: int) -> list[slice]:
+    """Return slices of pairs or sites for several threads."""
+    return [slice(start, start + per_task) for start in range(0, max(n, 1), per_task)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,7 +295,7 @@ def _facing_um(case: Case, side: float, reach_um: float) -> Floats:
         ends = first[piece.start : piece.stop + 1]
         return _kernels.facing_distances(xy, case.after, ends, side, min_cosine, reach_um / dbu_um)
 
-    found = parallel_map(distances, _task_slices(case.mask.n_sites), thread_count())
+    found = parallel_map(distances, _task_slices(case.mask.n_sites, SITES_PER_TASK), thread_count())
     return np.concatenate(found) * dbu_um
 
 

@@ -172,7 +172,7 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "best") -> t
     ------
     GeometryError
         When the layout violates a rule that removing sites cannot repair, such as gaps, growth, the size ratio of
-        neighbours, or the number of sites.
+        neighbours, or the number of sites; with ``"best"``, also when corners are sharper than ``angle_limit_deg``.
 
     Examples
     --------
@@ -184,6 +184,15 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "best") -> t
     """
     waivers = rules.waivers or {}
     active = rules.only(lambda name: RULES[name].repair is not None and name not in waivers)
+    sharp = _sharp_sites(layout, active) if repair == "best" else ()
+    if sharp:
+        raise GeometryError(
+            f"{len(sharp):,} of {layout.n_sites:,} sites have corners sharper than "
+            f"angle_limit_deg = {rules.angle_limit_deg:g}, which neither merging nor cutting repairs; set an "
+            "'angle_limit_deg' below their corners, such as 25, and "
+            "'min_angle_deg' for the corners, or drop them with repair='drop'",
+            sharp,
+        )
     current_index = np.arange(layout.n_sites)  # current index of each input site, -1 for dropped sites
     changes: list[Change] = []
     original = layout
@@ -388,7 +397,13 @@ def _merge_small(layout: Layout, rules: DesignRules, current_index: Ints, change
         report = layout.check(minimum_rules)
         if report.ok:
             break
-        rule_of = {v.site_ids[0]: result.rule for result in reversed(report.results) for v in result.violations}
+        sharp = set(_sharp_sites(layout, rules))  # merging does not repair their corners
+        rule_of = {
+            v.site_ids[0]: result.rule
+            for result in reversed(report.results)
+            for v in result.violations
+            if result.rule != "min_width_um" or v.site_ids[0] not in sharp
+        }
         group = joining_groups(layout, np.array(list(rule_of), dtype=np.int64))
         if np.array_equal(group, np.arange(layout.n_sites)):
             break
@@ -404,10 +419,16 @@ def _merge_small(layout: Layout, rules: DesignRules, current_index: Ints, change
     return layout, current_index
 
 
+def _sharp_sites(layout: Layout, rules: DesignRules) -> tuple[int, ...]:
+    """Return the sites that violate ``min_width_um`` with a width of 0, by their corners."""
+    report = layout.check(rules.only("min_width_um".__eq__))
+    return tuple(v.site_ids[0] for v in report.violations if v.rule == "min_width_um" and v.value == 0.0)
+
+
 def _format_violations(report: Report) -> str:
     return "; ".join(str(result) for result in report.results if not result.ok)
 
 
 def _is_minimum_rule(name: str) -> bool:
     """Return whether merging a site with a neighbour repairs violations of the rule."""
-    return RULES[name].repair == "merge"
+    return name in RULES and RULES[name].repair == "merge"

@@ -26,7 +26,7 @@ __all__ = ["hidden_figures", "new_axes", "new_figure"]
 #: Smallest ratio of a figure's shorter side to its longer one, which leaves space for axes, labels and colour bars.
 MIN_ASPECT_RATIO = 0.4
 
-#: Sides of figures, inches: of at least one letter, and of less than a wall.
+#: Longer side of a figure in inches.
 FIGURE_INCHES = Limits(above=0.0, low=0.1, at_most=200.0)
 
 _is_hidden: ContextVar[bool] = ContextVar("_is_hidden", default=False)

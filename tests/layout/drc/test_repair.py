@@ -147,7 +147,7 @@ def test_repair_may_drop_all_sites():
         die_um=(0, 0, 1, 1), max_growth=3.0, min_growth=0.1, max_neighbour_ratio=2.0, max_sites=5,
         waivers={"max_gap_um2": "no site remains to cover the die"},
     )  # fmt: skip
-    legal, changes = RINGS.enforce(rules)
+    legal, changes = RINGS.enforce(rules, repair="drop")
 
     assert legal.n_sites == 0
     assert changed(changes) == set(range(RINGS.n_sites))
@@ -249,3 +249,26 @@ def test_collapsed_sites_are_violations():
     assert [(v.rule, v.site_ids) for v in report.violations] == [("dbu_um", (1,))]
     assert layout.check(fs.DesignRules(max_sites=5, dbu_um=1e-4)).ok
     assert layout.enforce(fs.DesignRules(min_size_um=0.01))[0].n_sites == 1
+
+
+def test_sharp_corners_are_not_merged():
+    """At 90 degrees all annular sites have the width 0: merging would end with one site, which has no corners."""
+    rules = fs.DesignRules(min_width_um=1.0)
+    with pytest.raises(
+        GeometryError, match=r"512 of 512 sites have corners sharper than angle_limit_deg = 90, .* such as 25"
+    ):
+        RINGS.enforce(rules)
+    assert RINGS.enforce(rules, repair="merge")[0].n_sites == 0
+    legal, changes = RINGS.enforce(fs.DesignRules(min_width_um=1.0, angle_limit_deg=25.0))
+
+    assert legal.n_sites > 300
+    assert changes.after.area_um2 == pytest.approx(changes.before.area_um2)
+
+
+@pytest.mark.parametrize("repair", ["best", "drop", "shrink", "merge", "refill"])
+def test_collapsed_sites_are_dropped_by_all_repairs(repair):
+    layout = fs.Layout.from_rectangles([[0.0, 0.0], [5.0, 0.0]], [[2.0, 2.0], [2.0, 0.0004]])
+    legal, changes = layout.enforce(fs.DesignRules(max_size_um=9.0), repair=repair)
+
+    assert legal.n_sites == 1
+    assert [(change.rule, change.action, change.site_ids) for change in changes] == [("dbu_um", "dropped", (1,))]
