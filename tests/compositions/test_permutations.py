@@ -4,24 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from reference.shots import FLAT_SHOT
 
 import foveasim as fs
 from foveasim import explore
 
-SHOT = {
-    "scene": {
-        "kind": "flat",
-        "shape": [60, 60],
-        "pitch_um": 300.0,
-        "distance_m": 1.0,
-        "radiance_w_m2_sr_nm": 0.1,
-        "band_width_nm": 100.0,
-    },
-    "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
-    "layout": {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}},
-    "sensor": {"read_noise_e": 2.0, "capacitance_f": 4e-15, "bits": 10},
-    "exposure_s": 0.001,
-}
+SHOT = FLAT_SHOT | {"sensor": FLAT_SHOT["sensor"] | {"bits": 10}, "exposure_s": 0.001}
 RINGS = fs.layout.mosaic(fs.layout.log_polar(n_sectors=16, r_min_um=6.0, r_max_um=40.0, n_rings=5), "RGGB")
 ORDER = np.random.default_rng(5).permutation(RINGS.n_sites)
 LIGHT = fs.PowerMap(np.random.default_rng(6).random((1, 90, 90)) * 1e-3, fs.Grid.centred((90, 90), 1.0), [550.0])

@@ -6,26 +6,14 @@ import math
 
 import numpy as np
 import pytest
+from reference.shots import FLAT_SHOT
 
 from foveasim import explore
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, FileError, ParameterError
 from foveasim.explore.studies import plan, study
 
-SHOT = {
-    "scene": {
-        "kind": "flat",
-        "shape": [60, 60],
-        "pitch_um": 300.0,
-        "distance_m": 1.0,
-        "radiance_w_m2_sr_nm": 0.1,
-        "band_width_nm": 100.0,
-    },
-    "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
-    "layout": {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}},
-    "sensor": {"read_noise_e": 2.0, "capacitance_f": 4e-15, "dark_e_per_s": 0.0},
-    "exposure_s": 0.0001,
-}
+SHOT = FLAT_SHOT | {"sensor": FLAT_SHOT["sensor"] | {"dark_e_per_s": 0.0}, "exposure_s": 0.0001}
 WANTED_E = 1000.0
 
 

@@ -18,6 +18,7 @@ from functools import cache
 import numpy as np
 import pytest
 from cli.conftest import run_here
+from reference.shots import FLAT_SHOT
 from waiting import DEADLINE_S, has_ended, wait_until
 
 from foveasim import explore
@@ -28,20 +29,7 @@ from foveasim.explore.executor import CHUNK_S
 from foveasim.explore.sweeps.results import to_dataset, write_store
 from foveasim.explore.worker_cache import ShotRunner
 
-SHOT = {
-    "scene": {
-        "kind": "flat",
-        "shape": [60, 60],
-        "pitch_um": 300.0,
-        "distance_m": 1.0,
-        "radiance_w_m2_sr_nm": 0.1,
-        "band_width_nm": 100.0,
-    },
-    "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
-    "layout": {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}},
-    "sensor": {"read_noise_e": 2.0, "capacitance_f": 4e-15},
-    "exposure_s": 0.01,
-}
+SHOT = FLAT_SHOT
 #: 120 points with repeats that vary settings of all kinds: layout, lens, electronics, exposure time.
 VARY_120 = {
     "layout.parameters.n_x": [8, 12],
