@@ -33,6 +33,8 @@ BOTH_ROUNDS, LARGER_ROUNDS = 4, 12
 RETREAT_ROUNDING_UM = 1e-7
 #: Angle between the edges on both sides of an edge of a hexagon, less the rounding of its vertices.
 HEXAGON_DEG = 59.0
+#: Size of a site, in minimum widths, above which it is too narrow because of an arm, not because it is small.
+NARROW_SIZE = 4.0
 #: Rounding of a distance in steps of the manufacturing grid.
 GRID_ROUNDING = 1e-6
 
@@ -159,8 +161,9 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "best") -> t
         the remaining ones. ``"merge"`` first merges sites that are too small with
         the neighbour that shares the longest boundary, repeatedly, and drops the remaining ones. ``"refill"`` drops sites,
         and fills the area of sites that were too small, including the area that they enclose, with hexagons of the minimum
-        size. A new site has the column values of the nearest dropped site. ``"best"`` loses the least area: sites that are too
-        small are merged, those that are too close are cut, and only others are dropped.
+        size. A new site has the column values of the nearest dropped site. ``"best"`` merges sites that are too small, cuts
+        those that are too close, and drops only others. Sites that are too narrow are merged only if the result is wide
+        enough, or still small.
 
     Returns
     -------
@@ -172,7 +175,8 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "best") -> t
     ------
     GeometryError
         When the layout violates a rule that removing sites cannot repair, such as gaps, growth, the size ratio of
-        neighbours, or the number of sites; with ``"best"``, also when corners are sharper than ``angle_limit_deg``.
+        neighbours, or the number of sites; with ``"best"``, also when no site remains because all have corners sharper than
+        ``angle_limit_deg``.
 
     Examples
     --------
@@ -184,15 +188,6 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "best") -> t
     """
     waivers = rules.waivers or {}
     active = rules.only(lambda name: RULES[name].repair is not None and name not in waivers)
-    sharp = _sharp_sites(layout, active) if repair == "best" else ()
-    if sharp:
-        raise GeometryError(
-            f"{len(sharp):,} of {layout.n_sites:,} sites have corners sharper than "
-            f"angle_limit_deg = {rules.angle_limit_deg:g}, which neither merging nor cutting repairs; set an "
-            "'angle_limit_deg' below their corners, such as 25, and "
-            "'min_angle_deg' for the corners, or drop them with repair='drop'",
-            sharp,
-        )
     current_index = np.arange(layout.n_sites)  # current index of each input site, -1 for dropped sites
     changes: list[Change] = []
     original = layout
@@ -203,6 +198,15 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "best") -> t
     layout, current_index = _drop_violating_sites(layout, active, current_index, changes)
     if repair == "refill":
         layout = _refill(layout, original, active, changes)
+    sharp = () if layout.n_sites or repair != "best" else _sharp_sites(original, active)
+    if sharp:
+        raise GeometryError(
+            f"the repair would drop all sites: {len(sharp):,} of {original.n_sites:,} have corners sharper than "
+            f"angle_limit_deg = {rules.angle_limit_deg:g}, which neither merging nor cutting repairs; set an "
+            "'angle_limit_deg' below their corners, such as 25, and "
+            "'min_angle_deg' for the corners, or drop them with repair='drop'",
+            sharp,
+        )
     rest = layout.check(rules.only(lambda name: RULES[name].repair is None))
     if not rest.ok:
         raise GeometryError(f"the layout violates rules that removing sites cannot repair: {_format_violations(rest)}")
@@ -391,24 +395,32 @@ def _sites_to_remove(layout: Layout, result: RuleResult, is_dropped: Bools) -> I
 
 
 def _merge_small(layout: Layout, rules: DesignRules, current_index: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
-    """Merge sites that are too small with their neighbours, in rounds."""
-    minimum_rules = rules.only(_is_minimum_rule)
+    """
+    Merge sites that are too small with their neighbours, in rounds.
+
+    Merging always makes sites larger, but not always wider: neighbours of a site with a narrow arm would follow one by one.
+    A site that is too narrow is merged only if the result is wide enough, or still small.
+    """
+    minimum_rules, width_rules = rules.only(_is_minimum_rule), rules.only("min_width_um".__eq__)
+    is_narrow = np.zeros(layout.n_sites, bool)  # whatever is merged with it
     for _ in range(MAX_ROUNDS):
         report = layout.check(minimum_rules)
         if report.ok:
             break
-        sharp = set(_sharp_sites(layout, rules))  # merging does not repair their corners
+        is_narrow[list(_sharp_sites(layout, rules))] = True
         rule_of = {
             v.site_ids[0]: result.rule
             for result in reversed(report.results)
             for v in result.violations
-            if result.rule != "min_width_um" or v.site_ids[0] not in sharp
+            if result.rule != "min_width_um" or not is_narrow[v.site_ids[0]]
         }
         group = joining_groups(layout, np.array(list(rule_of), dtype=np.int64))
         if np.array_equal(group, np.arange(layout.n_sites)):
             break
+        _separate_narrow(layout, width_rules, rule_of, group, is_narrow)
         groups, label = np.unique(group, return_inverse=True)
         layout, current_index = merge(layout, label), label[current_index]
+        is_narrow = np.bincount(label, is_narrow) > 0
         order = np.argsort(current_index, kind="stable")
         boundaries = np.searchsorted(current_index[order], np.arange(groups.size + 1))
         is_joined = np.bincount(label) > 1
@@ -417,6 +429,25 @@ def _merge_small(layout: Layout, rules: DesignRules, current_index: Ints, change
             ids = order[boundaries[k] : boundaries[k + 1]]
             changes.append(Change(rule_of_group[k], "merged", tuple(sorted(int(i) for i in ids))))
     return layout, current_index
+
+
+def _separate_narrow(layout: Layout, rules: DesignRules, rule_of: dict[int, str], group: Ints, is_narrow: Bools) -> None:
+    """Separate pairs that would be large and too narrow, in ``group``, and mark the sites that required them."""
+    n_sites = layout.n_sites
+    sites = np.array(list(rule_of), dtype=np.int64)
+    seeks_width = np.array([rule == "min_width_um" for rule in rule_of.values()])
+    if not seeks_width.any():
+        return
+    label = np.unique(group, return_inverse=True)[1]
+    is_separate = np.zeros(n_sites, bool)
+    merged = merge(layout, label)
+    is_separate[[v.site_ids[0] for v in merged.check(rules).violations]] = True
+    is_separate[: merged.n_sites] &= merged.size_um > NARROW_SIZE * rules.min_width_um
+    is_separate &= np.bincount(label, minlength=n_sites) > 1
+    is_separate[label[sites[~seeks_width]]] = False
+    members = np.flatnonzero(is_separate[label])
+    group[members] = members
+    is_narrow[sites[seeks_width & is_separate[label[sites]]]] = True
 
 
 def _sharp_sites(layout: Layout, rules: DesignRules) -> tuple[int, ...]:

@@ -255,14 +255,34 @@ def test_sharp_corners_are_not_merged():
     """At 90 degrees all annular sites have the width 0: merging would end with one site, which has no corners."""
     rules = fs.DesignRules(min_width_um=1.0)
     with pytest.raises(
-        GeometryError, match=r"512 of 512 sites have corners sharper than angle_limit_deg = 90, .* such as 25"
+        GeometryError, match=r"drop all sites: 512 of 512 have corners sharper than angle_limit_deg = 90, .* such as 25"
     ):
         RINGS.enforce(rules)
     assert RINGS.enforce(rules, repair="merge")[0].n_sites == 0
     legal, changes = RINGS.enforce(fs.DesignRules(min_width_um=1.0, angle_limit_deg=25.0))
 
     assert legal.n_sites > 300
-    assert changes.after.area_um2 == pytest.approx(changes.before.area_um2)
+    assert changes.after.area_um2 > 0.99 * changes.before.area_um2
+    assert legal.size_um.max() == RINGS.size_um.max()  # the fovea does not become one site
+
+
+def test_narrow_sites_are_merged_only_if_that_makes_them_wide():
+    """Of 12 slivers around a square opening, 8 strips join the square behind them; the 4 angles would stay narrow."""
+    layer = fs.layout.grid(n_x=1, n_y=1, pitch_um=31.0)
+    squares = fs.layout.overlay(fs.layout.grid(n_x=12, n_y=12, pitch_um=10.0), layer, margin_um=3.0)
+    legal, changes = squares.enforce(fs.DesignRules(min_size_um=2.5, min_width_um=2.0))
+
+    assert (squares.n_sites, legal.n_sites) == (141, 129)
+    assert changes.before.area_um2 - changes.after.area_um2 == pytest.approx(4 * (10.0**2 - 8.5**2))
+    assert [len(change.site_ids) for change in changes] == [2] * 8 + [4]
+
+
+def test_sharp_sites_among_others_are_dropped():
+    sharp = fs.Layout.from_polygons([[[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]], [[20.0, 0.0], [29.0, 0.0], [29.0, 9.0], [20.0, 9.0]]])
+    legal, changes = sharp.enforce(fs.DesignRules(min_width_um=1.0))
+
+    assert legal.n_sites == 1
+    assert [(change.action, change.site_ids) for change in changes] == [("dropped", (0,))]
 
 
 @pytest.mark.parametrize("repair", ["best", "drop", "shrink", "merge", "refill"])
