@@ -431,7 +431,9 @@ def _merge_small(layout: Layout, rules: DesignRules, current_index: Ints, change
     return layout, current_index
 
 
-def _separate_narrow(layout: Layout, rules: DesignRules, rule_of: dict[int, str], group: Ints, is_narrow: Bools) -> None:
+def _separate_narrow(
+    layout: Layout, rules: DesignRules, rule_of: dict[int, str], group: Ints, is_narrow: Bools
+) -> None:
     """Separate pairs that would be large and too narrow, in ``group``, and mark the sites that required them."""
     n_sites = layout.n_sites
     sites = np.array(list(rule_of), dtype=np.int64)
@@ -442,7 +444,7 @@ def _separate_narrow(layout: Layout, rules: DesignRules, rule_of: dict[int, str]
     is_separate = np.zeros(n_sites, bool)
     merged = merge(layout, label)
     is_separate[[v.site_ids[0] for v in merged.check(rules).violations]] = True
-    is_separate[: merged.n_sites] &= merged.size_um > NARROW_SIZE * rules.min_width_um
+    is_separate[: merged.n_sites] &= merged.size_um > NARROW_SIZE * (rules.min_width_um or 0.0)
     is_separate &= np.bincount(label, minlength=n_sites) > 1
     is_separate[label[sites[~seeks_width]]] = False
     members = np.flatnonzero(is_separate[label])

@@ -278,7 +278,9 @@ def test_narrow_sites_are_merged_only_if_that_makes_them_wide():
 
 
 def test_sharp_sites_among_others_are_dropped():
-    sharp = fs.Layout.from_polygons([[[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]], [[20.0, 0.0], [29.0, 0.0], [29.0, 9.0], [20.0, 9.0]]])
+    sharp = fs.Layout.from_polygons(
+        [[[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]], [[20.0, 0.0], [29.0, 0.0], [29.0, 9.0], [20.0, 9.0]]]
+    )
     legal, changes = sharp.enforce(fs.DesignRules(min_width_um=1.0))
 
     assert legal.n_sites == 1
