@@ -434,7 +434,7 @@ def _merge_small(layout: Layout, rules: DesignRules, current_index: Ints, change
 def _separate_narrow(
     layout: Layout, rules: DesignRules, rule_of: dict[int, str], group: Ints, is_narrow: Bools
 ) -> None:
-    """Separate pairs that would be large and too narrow, in ``group``, and mark the sites that required them."""
+    """Separate pairs that would be large and too narrow, and mark their sites."""
     n_sites = layout.n_sites
     sites = np.array(list(rule_of), dtype=np.int64)
     seeks_width = np.array([rule == "min_width_um" for rule in rule_of.values()])

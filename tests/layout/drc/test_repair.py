@@ -266,7 +266,7 @@ def test_sharp_corners_are_not_merged():
     assert legal.size_um.max() == RINGS.size_um.max()  # the fovea does not become one site
 
 
-def test_narrow_sites_are_merged_only_if_that_makes_them_wide():
+def test_narrow_sites_join_wide_neighbours():
     """Of 12 slivers around a square opening, 8 strips join the square behind them; the 4 angles would stay narrow."""
     layer = fs.layout.grid(n_x=1, n_y=1, pitch_um=31.0)
     squares = fs.layout.overlay(fs.layout.grid(n_x=12, n_y=12, pitch_um=10.0), layer, margin_um=3.0)
