@@ -43,11 +43,12 @@ test-core:
 		cp tests/installation/calls.py "$$directory" && cd "$$directory" && MPLBACKEND=agg env -u PYTHONPATH \
 		env/bin/python calls.py --program env/bin/foveasim
 
-# The slow tests, too, those in a browser, and all pairs of features and invariants in tests/compositions instead of a sample.
+# The slow tests, too, those in a browser, all pairs of features and invariants in tests/compositions instead of a sample, and a third
+# of the tests marked nightly, which FOVEASIM_TESTS_COMMIT selects.
 test-all: $(VENV)/.installed-dev
 	FOVEASIM_TESTS=all $(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
 
-# All tests, with all invariants for all pairs of features.
+# All tests, with all of those marked nightly, and all invariants for all pairs of features.
 test-nightly: $(VENV)/.installed-dev
 	FOVEASIM_TESTS=nightly $(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
 
@@ -113,8 +114,9 @@ $(VENV)/.installed: $(VENV)/.made pyproject.toml
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.made pyproject.toml
-	@echo "installing foveasim and its development tools into $(VENV) (a minute or so)"
+	@echo "installing foveasim and its development tools into $(VENV), and compiling its kernels (two minutes or so)"
 	$(BIN)/python $(INSTALL) --editable '.[dev]'
+	$(BIN)/foveasim compile
 	touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-docs: $(VENV)/.made pyproject.toml

@@ -3,7 +3,8 @@ Selection of tests, their requirements, kernels, and distribution to processes.
 
 The default run leaves out tests marked ``slow`` and tests in a browser, except for those that ``slow(keep=...)`` selects: a
 number of parameter sets of each function, spread evenly, or parts of their names; its random tests have a third of the
-examples. Runs of named files and directories, and those with FOVEASIM_TESTS=all, contain all tests. ``needs("renderer")``,
+examples. Of the slow tests marked ``nightly``, the complete run contains a third, selected by the commit. Runs of named files
+and directories contain all tests, as do those with FOVEASIM_TESTS=nightly. ``needs("renderer")``,
 ``"chromium"``, ``"torch"`` and other modules mark requirements.
 """
 
@@ -21,7 +22,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 from browsers import CHROMIUM, open_chromium
-from effort import effort, examples
+from effort import commit, effort, examples, is_in_part
 
 from foveasim import compile_kernels
 
@@ -75,6 +76,7 @@ def pytest_configure(config):
     is_worker = hasattr(config, "workerinput")
     if not is_worker and config.args_source is config.ArgsSource.ARGS:
         os.environ.setdefault("FOVEASIM_TESTS", "all")
+        os.environ["FOVEASIM_TESTS_NAMED"] = "1"
     # New examples in each run on a developer's machine, the same ones in continuous integration.
     hypothesis.settings.register_profile(
         "foveasim", deadline=None, max_examples=examples(100), derandomize="CI" in os.environ
@@ -108,7 +110,8 @@ def needs(item):
 
 def slow_marker(item):
     """Return the marker of a slow test, else None."""
-    return item.get_closest_marker("slow") or (pytest.mark.slow if item.get_closest_marker("pages") else None)
+    is_slow = item.get_closest_marker("pages") or item.get_closest_marker("nightly")
+    return item.get_closest_marker("slow") or (pytest.mark.slow if is_slow else None)
 
 
 @pytest.hookimpl(tryfirst=True)  # before the selection by markers of the command line
@@ -117,7 +120,7 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         if "chromium" in needs(item):
             item.add_marker("pages")
-    if effort() != "default":
+    if effort() == "nightly" or (effort() == "all" and "FOVEASIM_TESTS_NAMED" in os.environ):
         return
     of_function = defaultdict(list)
     for item in items:
@@ -131,6 +134,9 @@ def pytest_collection_modifyitems(config, items):
         else:
             kept = {item for item in sets if any(part in item.name for part in keep)}
         dropped.update(set(sets) - kept)
+    if effort() == "all":
+        of_night = [item for item in items if item in dropped and item.get_closest_marker("nightly")]
+        dropped = {item for k, item in enumerate(of_night) if not is_in_part(k, commit())}
     config.hook.pytest_deselected(items=list(dropped))
     items[:] = [item for item in items if item not in dropped]
 

@@ -66,6 +66,7 @@ def differences(one, other, where="", visited=None):
                 yield from differences(getattr(one, name), getattr(other, name), f"{where}.{name}", visited)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("method", COPIES)
 def test_copies_of_public_objects_are_equal(used, method):
     found = []

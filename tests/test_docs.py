@@ -88,6 +88,7 @@ def _registries_stay():
         yield
 
 
+@pytest.mark.nightly
 @pytest.mark.slow(keep=("README", "quick_start"))
 @pytest.mark.usefixtures("_registries_stay")
 @pytest.mark.parametrize("page", [pytest.param(page, marks=NEEDS.get(page.stem, []), id=page.stem) for page in PAGES])

@@ -527,6 +527,7 @@ def test_every_kind_has_wrong_extensions():
     assert {registry.kind for registry, *_ in WRONG} == {registry.kind for registry in REGISTRIES}
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("registry", "item", "example", "expected"),
     [

@@ -27,6 +27,7 @@ SHOWN_INCHES, MIN_TEXT_PT = 736 / 96, 9.0
 DOTS_PER_INCH = 40.0
 
 
+@pytest.mark.nightly
 @pytest.mark.slow(keep=("02_light", "25_own", "16_four"))
 @pytest.mark.parametrize("path", PARAMETERS)
 def test_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):

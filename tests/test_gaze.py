@@ -38,6 +38,7 @@ def camera_of(layout=HEXAGONS, optics=OPTICS, *, read_noise_e=3.0, **parts):
 # -- scale and position ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("fit", ["cover", "contain", "width"])
 def test_scale_does_not_depend_on_gaze(fit):
     camera, scene = camera_of(optics=replace(OPTICS, f_number=2.0)), scene_of(fit=fit)

@@ -22,7 +22,7 @@ def stems(paths):
     return [pytest.param(path, marks=NEEDS.get(path.stem, []), id=path.stem) for path in paths]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("path", stems(NOTEBOOKS))
 def test_notebook_runs_and_shows_results(path, tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")

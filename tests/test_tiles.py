@@ -160,6 +160,7 @@ class MeasuredNoise(AdditiveNoise):
         return self.sigma_v
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("make", [Shading, LeakingCharge, MeasuredOffset, MeasuredNoise])
 def test_tiles_with_user_effect_equal_capture(camera, make):
     """Effects that depend on the position in the layout, or contain an array per site."""
@@ -224,6 +225,7 @@ def test_stored_tiles_of_zeros_are_complete(camera, tmp_path):
     np.testing.assert_array_equal(found.code[:], silent.capture(dark, exposure_s=0.01, seed=0).code)
 
 
+@pytest.mark.slow
 def test_tiles_of_lateral_colour_equal_capture(camera, scene):
     lens = fs.optics.LateralColour(wavelength_nm=(450.0, 535.0, 620.0), magnification=(1.01, 1.0, 1.005))
     coloured = camera.replace(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0, lateral_colour=lens))
@@ -302,6 +304,7 @@ def stored(camera, scene, tmp_path_factory):
     return write(tmp_path_factory.mktemp("tiles") / "capture.zarr", camera, scene)
 
 
+@pytest.mark.slow
 def test_stored_tiles_equal_complete_capture(stored, complete, camera):
     for name in ("expected_e", "electrons", "code"):
         np.testing.assert_array_equal(joined(stored, name), joined([stored], name))

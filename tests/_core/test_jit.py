@@ -215,7 +215,7 @@ def test_kernels_call_kernels_and_functions():
     assert total(np.arange(5.0)) == 10.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_functions_that_return_arrays_count_references(tmp_path):
     """
     Without reference counts, an array that is returned could be released while it is used.

@@ -84,6 +84,7 @@ def check_upright_picture_with_blind_spot(out):
     assert not seen[505:519, 505:519, 3].any()
 
 
+@pytest.mark.slow
 def test_run_writes_capture_of_settings(foveasim, folder):
     result = foveasim("run", "shot.yaml", "--set", "sensor.bits=12", "--set", "seed=4", "-o", "out", cwd=folder)
     capture = fs.Capture.load(folder / "out" / "shot_capture.npz")

@@ -73,6 +73,7 @@ def succeeded(result):
     return result.stdout
 
 
+@pytest.mark.slow
 def test_chip_is_converted_and_described(foveasim, folder, read):
     source = [word.replace("--cell", "--source-cell").replace("--layer", "--source-layer") for word in OPTIONS]
     succeeded(foveasim("convert", "chip.gds", "sensor.npz", *source, "--centre", cwd=folder))
@@ -96,6 +97,7 @@ def test_chip_is_checked(foveasim, folder):
     assert re.search(rf"min_space_um │ fail +│ +{n_pairs} │", there.stdout)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("is_report", [False, True], ids=["layout", "report"])
 def test_chip_is_viewed(foveasim, folder, is_report):
     (folder / "rules.yaml").write_text("{min_size_um: 7}")
@@ -120,6 +122,7 @@ def test_chip_is_compared_with_other_formats(foveasim, folder):
     assert "'layer' is an option of GDSII and OASIS files only" in rejected.stderr
 
 
+@pytest.mark.slow
 def test_options_are_not_for_other_files(foveasim, folder):
     succeeded(foveasim("run", "shot.yaml", *OPTIONS, "-o", "out", cwd=folder))
     (folder / "short.yaml").write_text(SHOT.replace("{file: chip.gds}", "chip.gds"))
@@ -133,6 +136,7 @@ def test_options_are_not_for_other_files(foveasim, folder):
         assert words in result.stderr
 
 
+@pytest.mark.slow
 def test_shot_reads_chip(foveasim, folder, read):
     succeeded(foveasim("run", "shot.yaml", *OPTIONS, "--centre", "-o", "out", cwd=folder))
 

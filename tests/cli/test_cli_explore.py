@@ -279,7 +279,7 @@ def test_failed_study_leaves_no_file(folder, monkeypatch):
     assert not list(folder.glob("own.db*"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_study_interrupted_twice_resumes_identically(foveasim, folder, monkeypatch):
     (folder / "slow.yaml").write_text(json.dumps(STUDY | {"trials": 24}))
 
@@ -304,6 +304,7 @@ def test_study_interrupted_twice_resumes_identically(foveasim, folder, monkeypat
     assert {trial.user_attrs["patient"] > 0.0 for trial in explore.finished_trials(found)} == {True}
 
 
+@pytest.mark.slow
 def test_study_without_valid_trial_exits_with_1(foveasim, folder):
     failing = STUDY | {"search": {"exposure_s": [-1.0, -2.0]}, "trials": 3}
     beyond = STUDY | {"constraints": {"n_sites": [None, 5]}, "trials": 2}
@@ -559,6 +560,7 @@ def labels_of_all_sorts(folder):
     }
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("out", ["dataset", "d.zarr"])
 def test_dataset_command_equals_call(foveasim, folder, out):
     labels = labels_of_all_sorts(folder)
@@ -617,7 +619,7 @@ def test_pictures_come_from_several_sources(folder):
         np.testing.assert_array_equal(array[4 * k]["electrons"], files[4 * k]["electrons"], err_msg=name)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_interrupted_dataset_resumes_identically(folder):
     (folder / "long.yaml").write_text(json.dumps(DATA_SET | {"cameras": 100, "per_shard": 10}))
     command = [sys.executable, "-m", "foveasim.cli", "dataset", "long.yaml", "--workers", "2"]

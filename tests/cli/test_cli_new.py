@@ -56,6 +56,7 @@ def test_starting_shot_is_simulated(new_file):
     assert shot.camera.sensor.layout.check(shot.rules).ok
 
 
+@pytest.mark.slow
 def test_starting_shot_runs(foveasim, new_file):
     path = new_file("shot")
     result = foveasim("run", path.name, "--set", *SMALL, "--out", "out", cwd=path.parent)

@@ -79,6 +79,7 @@ def test_run_prints_names_as_they_are(foveasim, marked, environment):
     assert re.search(rf" {re.escape(stem)}( |:|\x1b)", result.stdout)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("arguments", "code", "printed"),
     [

@@ -240,6 +240,7 @@ def ask(port, host=None, first="GET / HTTP/1.1", more=""):
         return b"".join(iter(lambda: connection.recv(1 << 16), b""))
 
 
+@pytest.mark.slow
 def test_served_page_survives_clients_that_reset(served_port):
     for n_bytes in (0, 1, 100_000):
         for _ in range(5):

@@ -61,6 +61,7 @@ def test_identical_layouts_have_identical_measures(compared):
     assert any(compared.differences(name).median[1] != 0.0 for name in MEASURES)
 
 
+@pytest.mark.slow
 def test_fovea_is_better_at_centre_only(compared):
     for name in ("psnr_db", "nyquist_per_mm", "information_bit_per_mm2"):
         values = compared.summary(name, by_eccentricity=True).median
@@ -394,6 +395,7 @@ def test_best_values_are_marked(compared):
     assert best_cameras(changed.summary)[list(MEASURES).index("shift_sigma_um")] is None
 
 
+@pytest.mark.slow
 def test_report_begins_with_the_verdict(compared, tmp_path):
     compared.write(tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text("utf-8")

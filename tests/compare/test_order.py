@@ -89,6 +89,7 @@ def test_comparison_is_independent_of_order(kind):
             np.testing.assert_allclose(same, one, rtol=1e-5)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.filterwarnings("ignore::foveasim.errors.CoverageWarning")
 @pytest.mark.parametrize("axis", ["image", "sensor"])
 def test_camera_has_the_reference_of_its_gaze(axis):
@@ -107,6 +108,7 @@ def test_camera_has_the_reference_of_its_gaze(axis):
         np.testing.assert_allclose(there[:, :-n_pixels], here[:, n_pixels:], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_scenes_are_framed_for_all_layouts():
     layouts = {
         "wide": fs.layout.grid(n_x=60, n_y=20, pitch_um=2.0),

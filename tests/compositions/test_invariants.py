@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import os
 import pickle
 import threading
 import warnings
@@ -18,7 +17,7 @@ import cloudpickle
 import numpy as np
 import pytest
 import yaml
-from effort import effort
+from effort import commit, effort
 from reference.covering import N_DEFAULT, cases, invariants, pairs_of, possible_pairs, read_rows
 from reference.features import axes, is_possible, settings_of, settings_with
 
@@ -30,7 +29,7 @@ from foveasim.errors import FoveasimWarning
 from foveasim.explore import Dataset
 
 ROWS = read_rows()
-CASES = cases(ROWS, effort=effort(), commit=os.environ.get("FOVEASIM_TESTS_COMMIT", ""))
+CASES = cases(ROWS, effort=effort(), commit=commit())
 #: Rounding of integrals: sums over rows of a map in another order.
 ROUNDING = 1e-9
 N_FRAMES = 200

@@ -278,6 +278,7 @@ def test_wavelengths_outside_tables_are_rejected_early(shot_file):
         read_shot(shot_file, ["sensor.qe={kind: silicon, depth_um: 3}", "scene.wavelength_nm=[1500]"])
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -596,6 +597,7 @@ def test_regions_are_vertices_or_wkt(tmp_path):
     assert layout.area_um2[layout.columns["zone"] == 0].sum() == pytest.approx(32.0)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     "path", [*sorted((REPOSITORY / "gallery").glob("*.yaml")), *demo_settings()], ids=lambda p: p.stem
 )

@@ -238,6 +238,7 @@ def test_boolean_labels_become_integers():
     assert [sample["label"] for sample in data] == [1, 0]
 
 
+@pytest.mark.slow
 def test_bit_depths_give_equal_electrons(tmp_path):
     """One picture with 8 bits, 16 bits and floating-point numbers, in a directory, a zip file and memory."""
     picture = pictures(1)[0]

@@ -221,6 +221,7 @@ def test_trials_must_be_multiple_of_batch():
         explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=6, batch=4)
 
 
+@pytest.mark.slow
 def test_study_file_is_locked(tmp_path):
     def run(file, metric):
         explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=3, metrics={"m": metric}, storage=file)
@@ -329,6 +330,7 @@ def mixed_study(tmp_path_factory):
     return stored(storage)
 
 
+@pytest.mark.slow
 def test_finished_trials_contain_typed_choices(mixed_study):
     trials = explore.finished_trials(mixed_study)
 
@@ -384,6 +386,7 @@ def test_best_table_prints_typed_choices():
     assert str(cells[4]) == typed["optics.emission"]
 
 
+@pytest.mark.slow
 def test_study_of_other_plan_is_unchanged(tmp_path):
     explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=1, storage=tmp_path / "s.db")
 

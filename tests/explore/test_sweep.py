@@ -721,6 +721,7 @@ def test_store_of_other_sweep_is_unchanged(tmp_path):
     assert explore.open_results(store)["sensor.bits"].values.tolist() == [8, 9, 10]
 
 
+@pytest.mark.slow
 def test_equally_named_metrics_are_distinguished(tmp_path):
     def fraction_above(level):
         return lambda _, __, capture: float((capture.code > level).mean())
@@ -906,6 +907,7 @@ def test_listed_points_are_labelled_with_settings():
 # -- shared components ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_shared_components_are_built_once():
     plan = plan_120()
     runner = runner_of(plan)
@@ -995,6 +997,7 @@ def test_camera_reuses_images_and_compiled_layout():
         camera.capture(shot.scene, exposure_s=0.01, seed=1, photo_e_per_s=known[:3])
 
 
+@pytest.mark.slow
 def test_framing_follows_lens_and_layout():
     scene = {"kind": "picture", "picture": "skimage:camera", "fit": "width", "distance_m": 1.0, "wavelength_nm": 550}
     scene |= {"band_width_nm": 100.0, "peak_radiance_w_m2_sr_nm": 0.1}
@@ -1122,6 +1125,7 @@ def test_unwritable_store_is_rejected_before_start(tmp_path, store):
         explore.run_sweep(plan_3(), out=tmp_path / store)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("address", ["127.0.0.1", "tcp://", "foo://host:1", "silent"])
 def test_unreachable_scheduler_is_rejected_before_start(tmp_path, monkeypatch, address):
     monkeypatch.setattr("foveasim.explore.cluster.SCHEDULER_S", 0.5)
@@ -1265,6 +1269,7 @@ def attempt(address, arguments, function):
         asyncio.run(ask())
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("certificate", ["none", "another"])
 def test_only_owner_runs_code_on_local_workers(certificate, tmp_path):
     from distributed import Security

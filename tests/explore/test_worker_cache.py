@@ -354,7 +354,7 @@ def compare_with_fresh(runner, base, values):
     return unchanged
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_cached_components_equal_fresh_ones(runner):
     values = list(varied(SHOT, aberrations=False))
 

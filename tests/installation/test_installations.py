@@ -68,6 +68,7 @@ def test_core_installation_works_or_names_extra(core):
     assert len(required) < len(core) / 3
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "extra",
     [pytest.param(extra, marks=[pytest.mark.needs(what) for what in BEYOND_DEV.get(extra, ())]) for extra in EXTRAS],

@@ -165,6 +165,7 @@ def test_labelled_arrays_round_trip_small_maps(shape):
     assert_same(from_xarray(to_xarray(power_map)), power_map)
 
 
+@pytest.mark.slow
 def test_existing_map_is_overwritten(tmp_path):
     for extension in EXTENSIONS:
         for power_map in (letter_map(), random_map()):

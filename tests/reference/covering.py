@@ -16,12 +16,12 @@ from collections import Counter
 from itertools import combinations, product
 from pathlib import Path
 
+from effort import is_in_part
+
 DIRECTORY = Path(__file__).parents[1] / "compositions"
 TABLE = DIRECTORY / "covering.csv"
 #: Rows of the default run: each feature in one of them, each invariant in six.
 N_DEFAULT = 90
-#: Parts of the remaining pairs of a row and another invariant; one of them runs for each commit.
-N_PARTS = 3
 #: Rows that are tried for each one of the table: more make the table a little shorter.
 N_CANDIDATES = 30
 
@@ -46,8 +46,7 @@ def cases(rows, *, effort, commit="") -> dict[str, list[tuple[str, ...]]]:
     if effort != "nightly" and not commit:
         return found
     for (i, (*features, own)), (j, invariant) in product(enumerate(rows), enumerate(found)):
-        is_in_part = effort == "nightly" or (i + j) % N_PARTS == int(commit, 16) % N_PARTS
-        if invariant != own and is_in_part:
+        if invariant != own and (effort == "nightly" or is_in_part(i + j, commit)):
             found[invariant].append(tuple(features))
     return found
 

@@ -77,7 +77,7 @@ def test_pages_have_no_serious_violations(browser, tmp_path, make):
     assert found == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_studio_has_no_serious_violations(visit):
     widths = (1920, 1280, 390)
     page = visit(width=widths[0], height=1000)

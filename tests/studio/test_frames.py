@@ -84,6 +84,7 @@ def test_video_frames_are_exact(recorder, clip):
         assert np.array_equal(codes(recorder), Engine(n_threads=1).simulate(picture).capture.code)
 
 
+@pytest.mark.slow
 def test_frames_leave_the_undo_steps(recorder, clip):
     first = recorder.session.history.settings
     opened(recorder, clip)
@@ -99,6 +100,7 @@ def test_frames_leave_the_undo_steps(recorder, clip):
     assert recorder.do(do="redo", id=23)["film"]["n"] == 9
 
 
+@pytest.mark.slow
 def test_frames_use_constant_disk_and_cache(recorder, clip):
     opened(recorder, clip)
     sizes = []
@@ -121,6 +123,7 @@ def test_missing_frames_give_one_line(recorder, clip, n):
     assert np.array_equal(codes(recorder), before)
 
 
+@pytest.mark.slow
 def test_only_newest_waiting_frame_is_decoded(recorder, clip):
     opened(recorder, clip)
     version = recorder.session._version
@@ -158,6 +161,7 @@ def test_corrupt_videos_keep_the_scene(recorder, name, content):
     assert recorder.session.history.settings == before
 
 
+@pytest.mark.slow
 def test_videos_are_decoded_outside(recorder, clip, monkeypatch):
     av = pytest.importorskip("av")
     monkeypatch.setattr(av, "open", None)
@@ -320,6 +324,7 @@ def test_finer_sites_have_better_pictures(settings):
     assert fovea_um(fine.capture.layout) == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("fit", ["cover", "contain"])
 def test_comparison_is_independent_of_variant_order(settings, fit):
     engine = Engine(n_threads=1)
@@ -347,6 +352,7 @@ def test_comparison_is_independent_of_variant_order(settings, fit):
 # -- notebook, archive, links -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_notebook_gives_identical_codes(recorder, clip, tmp_path, monkeypatch):
     import matplotlib as mpl
 

@@ -417,6 +417,7 @@ def test_path_works_by_keyboard(visit):
     assert keys.n_pointed == 0
 
 
+@pytest.mark.nightly
 def test_row_has_no_serious_violations(visit):
     page = visit(width=1920, height=844)
     with_rows(page)

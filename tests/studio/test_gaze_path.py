@@ -119,6 +119,7 @@ def test_replay_needs_a_path(recorder):
 # -- videos -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_frame_and_gaze_are_one_message(recorder, clip):
     opened(recorder, clip)
     session, seen = recorder.session, []
@@ -172,6 +173,7 @@ def test_noisy_frames_have_the_seed_of_captures(recorder, clip):
     assert np.array_equal(codes(recorder), expected.code)
 
 
+@pytest.mark.slow
 def test_replayed_frames_are_one_undo_step(recorder, clip):
     opened(recorder, clip)
     n_states = len(recorder.session.history.states)
@@ -186,6 +188,7 @@ def test_replayed_frames_are_one_undo_step(recorder, clip):
     assert state["film"]["n"] == 5
 
 
+@pytest.mark.slow
 def test_failed_frames_keep_the_gaze(recorder, clip):
     opened(recorder, clip)
     before = recorder.do(do="frame", n=3, follows=True, final=True, id=9)
@@ -284,6 +287,7 @@ def test_random_path_needs_a_larger_image(recorder):
     assert "does not extend beyond the photosites" in state["errors"]["saccades"]
 
 
+@pytest.mark.slow
 def test_random_path_has_frames_of_video(recorder, clip):
     opened(recorder, clip)
     recorder.do(do="set", key="scene.pitch_um", value=2000.0, id=3)

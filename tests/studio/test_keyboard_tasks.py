@@ -64,7 +64,7 @@ def test_photograph_is_captured(keys):
     assert np.ptp(codes(page)) > 50
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_square_sensor_has_same_budget(keys):
     page = keys.page
     keys.use("#freeze")
@@ -82,7 +82,7 @@ def test_square_sensor_has_same_budget(keys):
     assert rows["n_sites"][1] == pytest.approx(rows["n_sites"][0], rel=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_chip_is_drawn_and_repaired(keys, tmp_path):
     page = keys.page
     keys.choose(".control[data-key='layout'] select", "grid")
@@ -118,7 +118,7 @@ def test_chip_is_drawn_and_repaired(keys, tmp_path):
     assert layout.check(fs.DesignRules(min_size_um=2.499)).ok
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_lecture_is_downloaded(keys, tmp_path):
     page = keys.page
     keys.show("solid", "mtf", "photon_transfer", "snr")
@@ -132,7 +132,7 @@ def test_lecture_is_downloaded(keys, tmp_path):
     assert page.is_visible("#tile-solid canvas")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_sensor_with_requirements(visit, tmp_path):
     own = Server(tmp_path)
     try:
@@ -174,6 +174,7 @@ def test_exposure_for_a_ratio_is_found(keys):
     assert setting(page, "exposure_s") == 0.02
 
 
+@pytest.mark.nightly
 def test_hexagons_against_squares(keys):
     page = keys.page
     keys.show("variants")

@@ -41,6 +41,7 @@ def test_colouring_ends_with_its_generator(recorder, settings, other):
     assert (code_part(recorder) == codes_of({**settings, "layout": after["settings"]["layout"]})).all()
 
 
+@pytest.mark.slow
 def test_edits_of_the_user_remain(recorder):
     """A colouring is added after other edits, and only where it is missing."""
     rotation = {"kind": "rotate", "angle_deg": 15.0}
@@ -57,6 +58,7 @@ def test_edits_of_the_user_remain(recorder):
     assert choose(recorder, "hexagonal")["settings"]["layout"].get("mosaic") is None
 
 
+@pytest.mark.slow
 def test_filters_bring_their_mosaic(recorder):
     recorder.do(do="set", key="sensor.filters", value=None)
     choose(recorder, "sunflower")

@@ -218,6 +218,7 @@ def make_threaded():
         session.close()
 
 
+@pytest.mark.slow
 def test_rest_completes_a_preview(large, make_threaded):
     session = make_threaded(large)
     listener = Listener(session)
@@ -244,6 +245,7 @@ def test_rest_releases_unused_memory(settings, make_threaded, monkeypatch):
     assert session._rest_s == _session.FORGET_S
 
 
+@pytest.mark.slow
 def test_complete_result_releases_memory(large, make_threaded, monkeypatch):
     released = threading.Event()
     monkeypatch.setattr(_session, "RELEASE_S", 0.05)

@@ -278,6 +278,7 @@ def test_second_connection_restores_session(served):
     assert np.array_equal(first.code, second.code)
 
 
+@pytest.mark.slow
 def test_tabs_have_separate_sessions(served, settings):
     async def visit():
         one, two = await opened(served), await opened(served)
@@ -303,6 +304,7 @@ def test_short_messages_do_not_wait(served):
         assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
 
 
+@pytest.mark.slow
 def test_duplicated_tab_has_a_copy(served, settings, tmp_path):
     """Both pages have the same state at first, files included, and change separately."""
     write_picture(tmp_path / "photo.png", np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8))

@@ -92,6 +92,7 @@ def test_only_selected_views_are_computed(recorder):
     assert recorder.part_names == ["columns"]
 
 
+@pytest.mark.slow
 def test_hidden_views_retain_no_results(recorder):
     recorder.do(do="views", names=["picture"])
     earlier = weakref.ref(recorder.session.result.capture)
@@ -409,6 +410,7 @@ def test_restored_settings_give_same_codes(recorder, make_session):
     assert np.array_equal(code_part(other), expected)
 
 
+@pytest.mark.slow
 def test_alternatives_from_page_are_valid(recorder):
     controls = next(message for message in recorder.messages if message["kind"] == "controls")["controls"]
     control = next(control for control in controls if control["id"] == "layout")
@@ -473,6 +475,7 @@ def test_texts_describe_current_settings(recorder, settings):
     assert np.array_equal(names["capture"].code, recorder.session.result.capture.code)
 
 
+@pytest.mark.slow
 def test_saved_settings_give_same_codes(make_session, tmp_path):
     out = tmp_path / "out"
     recorder = make_session(out=out)
@@ -800,7 +803,7 @@ def other_values(control):
             return []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_no_setting_leaves_stale_views(make_session, settings):
     lens = {"kind": "brown_conrady", "focal_um": 8000.0, "k1": -0.1, "centre_um": [1.0, 0.5]}
     settings = {**settings, "distortion": lens}

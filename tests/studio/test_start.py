@@ -75,6 +75,7 @@ def test_template_fills_its_format(recorder, generator, n_sites):
     assert max(-x0_um, x1_um) <= 0.5 * expected_um[0] * (1.0 + 1e-9)
 
 
+@pytest.mark.slow
 def test_new_sensor_is_one_step(recorder, settings):
     create(recorder, generator="sunflower")
     state = recorder.do(do="undo", id=2)
@@ -107,6 +108,7 @@ def test_electronics_are_those_of_the_preset(recorder, name):
     assert fs.sensor.PRESETS["mobile"].settings() != fs.sensor.PRESETS["scientific"].settings()
 
 
+@pytest.mark.slow
 def test_chart_covers_a_large_sensor(recorder):
     """The checkerboard of these tests is far smaller than one inch."""
     state = create(recorder, size_um=list(OPTICAL_FORMATS["1"].size_um))

@@ -76,6 +76,7 @@ def test_points_equal_captures_of_changed_shots(recorder):
     assert found["start"]["results"][0] == central_code_dn(captured(SETTINGS))
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     "axis",
     [

@@ -292,6 +292,7 @@ def test_missing_points_have_a_reason(visit):
     assert "–" in page.inner_text("#tile-sweep tbody")
 
 
+@pytest.mark.nightly
 def test_sweep_fits_and_is_accessible(visit):
     page = open_sweep(visit, width=1920, height=1080)
     choose_axis(page, "Setting", "exposure_s", n=3)

@@ -744,6 +744,7 @@ def test_captures_of_different_sensors_are_rejected(tmp_path, other, resume):
     assert count_recorded_frames(tmp_path / "v.zarr") == (2 if resume else 0)
 
 
+@pytest.mark.slow
 def test_failed_write_leaves_existing_files(tmp_path):
     def failing():
         yield from captures_of(2)
@@ -758,6 +759,7 @@ def test_failed_write_leaves_existing_files(tmp_path):
     assert read_recording(tmp_path / "v.zarr").n_frames == 3
 
 
+@pytest.mark.slow
 def test_only_recordings_are_overwritten(tmp_path):
     write_video(captures_of(3), tmp_path / "v.zarr")
     write_video(captures_of(2), tmp_path / "v.zarr")
@@ -837,6 +839,7 @@ def test_gif_contains_all_frames(tmp_path):
         assert gif.info["duration"] == 100
 
 
+@pytest.mark.slow
 def test_unknown_extension_or_no_captures_is_rejected(tmp_path):
     with pytest.raises(FileError, match="must end in"):
         write_video(captures_of(1), tmp_path / "v.txt")
@@ -1036,6 +1039,7 @@ def codes_of(path, n):
     return zarr.open_array(str(path if path.exists() else partial_path(path)), path="code", mode="r")[:n]
 
 
+@pytest.mark.slow
 def test_frames_are_written_at_time_intervals(tmp_path, monkeypatch):
     path, n_recorded = tmp_path / "v.zarr", []
 
@@ -1233,6 +1237,7 @@ def test_recording_is_locked_while_writing(tmp_path):
     assert np.array_equal(read_recording(path).code[:], [c.code for c in rolling(0)])
 
 
+@pytest.mark.slow
 def test_finished_recording_is_unchanged(tmp_path):
     path = tmp_path / "v.zarr"
     write_video(rolling(0), path, resume=True, plan={"a": 1})
@@ -1441,6 +1446,7 @@ def test_stopped_command_resumes(directory, capsys):
     assert files_of(out) == files_of(directory / "expected.zarr")
 
 
+@pytest.mark.slow
 def test_corrupt_frame_loses_no_recorded_frame(directory, capsys):
     good = (directory / "frames" / "2.png").read_bytes()
     (directory / "frames" / "2.png").write_bytes(good[:-100].ljust(len(good), b"\0"))
@@ -1455,6 +1461,7 @@ def test_corrupt_frame_loses_no_recorded_frame(directory, capsys):
     assert read_recording(directory / "v.zarr").frame.tolist() == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_command_leaves_finished_recordings_unchanged(directory, capsys):
     arguments = ("shot.yaml", "--frames", "frames", "--out", "v.zarr")
     assert command(*arguments) == 0

@@ -93,6 +93,7 @@ def pixels_of(png):
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGBA"))
 
 
+@pytest.mark.slow
 def test_html_is_self_contained_and_escaped(items):
     for item in items.values():
         page = Page(item._repr_html_())
@@ -113,6 +114,7 @@ def test_html_has_no_colours_of_text(items):
         assert all(b in {"none", "currentColor"} or b.startswith("#") for b in backgrounds)
 
 
+@pytest.mark.slow
 def test_html_and_thumbnails_are_small(items):
     for name, item in items.items():
         html = item._repr_html_()

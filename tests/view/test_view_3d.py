@@ -105,6 +105,7 @@ def test_triangles_lie_inside_their_site():
 # -- PyVista data --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_polydata_cells_have_all_columns():
     layout = fs.layout.hexagonal(n_columns=4, n_rows=3, pitch_um=2.0).with_columns(zone=np.arange(12) // 5)
     mesh = layout.to_pyvista()
@@ -536,6 +537,7 @@ def test_right_click_finds_visible_site():
     plot.close()
 
 
+@pytest.mark.slow
 @pytest.mark.needs("renderer")
 def test_both_renderers_shade_lenses_alike():
     model = solids(fs.layout.grid(n_x=5, n_y=5, pitch_um=3.0), SensorStack(n_lens_corners=16))
@@ -715,6 +717,7 @@ def test_missing_drivers_do_not_crash_interpreter(machine):
     assert all("apt install libegl1 libgl1" in message for message in messages)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("outcome", ["crashes", "raises", "hangs"])
 def test_failed_trial_gives_no_renderer(outcome, monkeypatch):
     trials = {

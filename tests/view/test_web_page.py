@@ -165,6 +165,7 @@ def snr_column(capture):
     return page.arrays[names[0]] if names else None
 
 
+@pytest.mark.slow
 def test_page_snr_includes_quantisation():
     expected_e = CAPTURE.expected_e
 
@@ -827,6 +828,7 @@ def test_solid_picture_contains_scale_bar_and_legend(visit, tmp_path):
             assert (np.abs(foot - FILTER_COLOURS[name]).max(axis=2) <= 8).sum() >= 4
 
 
+@pytest.mark.slow
 def test_many_white_sites_are_coloured_by_size():
     def colouring(layout):
         text = solid_page(layout)
@@ -1005,6 +1007,7 @@ def test_unshowable_surfaces_raise_by_name():
         bodies_of([replace(mesh, triangles=mesh.triangles[:0])], MOSAIC)
 
 
+@pytest.mark.slow
 def test_solid_page_needs_no_trimesh(monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     monkeypatch.setitem(sys.modules, "manifold3d", None)

@@ -776,7 +776,7 @@ HARMLESS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("extension", "name"), [(extension, name) for extension, bombs in BOMBS.items() for name in bombs]
 )
