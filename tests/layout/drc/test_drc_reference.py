@@ -45,13 +45,12 @@ def die_in(layout, fraction):
 
 def between(values, fraction):
     """Return a limit below, between or above the values, not close to any of them."""
-    distinct = []
-    for value in sorted(value for value in values if value > 1e-5):
-        if not distinct or value - distinct[-1] > 1e-5 * max(1.0, value):
-            distinct.append(value)
-    if not distinct:
+    ordered = sorted(value for value in values if value > 1e-5)
+    if not ordered:
         return 0.5
-    limits = [0.5 * distinct[0], *(0.5 * (a + b) for a, b in pairwise(distinct)), 1.5 * distinct[-1]]
+    # In gaps between neighbours: values may follow each other closely over a long range.
+    between_values = [0.5 * (a + b) for a, b in pairwise(ordered) if b - a > 1e-5 * max(1.0, b)]
+    limits = [0.5 * ordered[0], *between_values, 1.5 * ordered[-1]]
     return limits[int(fraction * len(limits))]
 
 
@@ -101,6 +100,13 @@ FIELD_RULES = {"min_density", "max_density", "max_data_rate_gbit_per_s", "max_tr
 
 def test_every_rule_has_reference_implementation():
     assert set(REFERENCES) | FIELD_RULES == set(RULES)
+
+
+def test_limits_are_far_from_values():
+    values = [1.0 + 9e-6 * k for k in range(3)]
+
+    assert [between(values, fraction) for fraction in (0.0, 0.99)] == [0.5, 1.5 * values[-1]]
+    assert between([*values, 2.0], 0.5) == 0.5 * (values[-1] + 2.0)
 
 
 @pytest.mark.slow(keep=4)
