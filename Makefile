@@ -54,7 +54,7 @@ test-nightly: $(VENV)/.installed-dev
 
 # All tests in a browser.
 test-pages: $(VENV)/.installed-dev
-	FOVEASIM_TESTS=all FOVEASIM_TESTS_NEED=chromium $(BIN)/python -m pytest $(PARALLEL) -m pages $(PYTEST_ARGS)
+	FOVEASIM_TESTS=nightly FOVEASIM_TESTS_NEED=chromium $(BIN)/python -m pytest $(PARALLEL) -m pages $(PYTEST_ARGS)
 
 # Deprecation warnings between old versions of dependencies are ignored.
 test-lowest: $(LOWEST)/.installed

@@ -33,6 +33,6 @@ def commit() -> str:
     return os.environ.get("FOVEASIM_TESTS_COMMIT", "")
 
 
-def is_in_part(k: int, commit: str) -> bool:
+def is_in_part(k: int, commit_hash: str) -> bool:
     """Return whether the k-th nightly test is one of those that a commit selects."""
-    return k % N_PARTS == int(commit or "0", 16) % N_PARTS
+    return k % N_PARTS == int(commit_hash or "0", 16) % N_PARTS

@@ -198,14 +198,13 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "best") -> t
     layout, current_index = _drop_violating_sites(layout, active, current_index, changes)
     if repair == "refill":
         layout = _refill(layout, original, active, changes)
-    sharp = () if layout.n_sites or repair != "best" else _sharp_sites(original, active)
+    sharp = [] if layout.n_sites or repair != "best" else _sharp_sites(original.check(active))
     if sharp:
         raise GeometryError(
             f"the repair would drop all sites: {len(sharp):,} of {original.n_sites:,} have corners sharper than "
             f"angle_limit_deg = {rules.angle_limit_deg:g}, which neither merging nor cutting repairs; set an "
-            "'angle_limit_deg' below their corners, such as 25, and "
-            "'min_angle_deg' for the corners, or drop them with repair='drop'",
-            sharp,
+            "'angle_limit_deg' below their corners, such as 25, and 'min_angle_deg' for the corners",
+            tuple(sharp),
         )
     rest = layout.check(rules.only(lambda name: RULES[name].repair is None))
     if not rest.ok:
@@ -402,12 +401,12 @@ def _merge_small(layout: Layout, rules: DesignRules, current_index: Ints, change
     A site that is too narrow is merged only if the result is wide enough, or still small.
     """
     minimum_rules, width_rules = rules.only(_is_minimum_rule), rules.only("min_width_um".__eq__)
-    is_narrow = np.zeros(layout.n_sites, bool)  # whatever is merged with it
+    is_narrow = np.zeros(layout.n_sites, bool)  # sites that merging does not widen
     for _ in range(MAX_ROUNDS):
         report = layout.check(minimum_rules)
         if report.ok:
             break
-        is_narrow[list(_sharp_sites(layout, rules))] = True
+        is_narrow[_sharp_sites(report)] = True
         rule_of = {
             v.site_ids[0]: result.rule
             for result in reversed(report.results)
@@ -435,27 +434,24 @@ def _separate_narrow(
     layout: Layout, rules: DesignRules, rule_of: dict[int, str], group: Ints, is_narrow: Bools
 ) -> None:
     """Separate pairs that would be large and too narrow, and mark their sites."""
-    n_sites = layout.n_sites
     sites = np.array(list(rule_of), dtype=np.int64)
     seeks_width = np.array([rule == "min_width_um" for rule in rule_of.values()])
     if not seeks_width.any():
         return
     label = np.unique(group, return_inverse=True)[1]
-    is_separate = np.zeros(n_sites, bool)
     merged = merge(layout, label)
-    is_separate[[v.site_ids[0] for v in merged.check(rules).violations]] = True
-    is_separate[: merged.n_sites] &= merged.size_um > NARROW_SIZE * (rules.min_width_um or 0.0)
-    is_separate &= np.bincount(label, minlength=n_sites) > 1
-    is_separate[label[sites[~seeks_width]]] = False
-    members = np.flatnonzero(is_separate[label])
+    is_bad = np.zeros(merged.n_sites, bool)
+    is_bad[[v.site_ids[0] for v in merged.check(rules).violations]] = True
+    is_bad &= (merged.size_um > NARROW_SIZE * (rules.min_width_um or 0.0)) & (np.bincount(label) > 1)
+    is_bad[label[sites[~seeks_width]]] = False  # too small: any neighbour helps
+    members = np.flatnonzero(is_bad[label])
     group[members] = members
-    is_narrow[sites[seeks_width & is_separate[label[sites]]]] = True
+    is_narrow[sites[seeks_width & is_bad[label[sites]]]] = True
 
 
-def _sharp_sites(layout: Layout, rules: DesignRules) -> tuple[int, ...]:
+def _sharp_sites(report: Report) -> list[int]:
     """Return the sites that violate ``min_width_um`` with a width of 0, by their corners."""
-    report = layout.check(rules.only("min_width_um".__eq__))
-    return tuple(v.site_ids[0] for v in report.violations if v.rule == "min_width_um" and v.value == 0.0)
+    return [v.site_ids[0] for v in report.violations if v.rule == "min_width_um" and v.value == 0.0]
 
 
 def _format_violations(report: Report) -> str:
