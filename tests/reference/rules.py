@@ -81,8 +81,14 @@ def _left_part(edge, other):
 
 
 def _facing_um(polygon, side, angle_limit_deg):
-    """Return the smallest distance of facing edges, in front of each other, across a site (side 1) or outside it (-1)."""
+    """
+    Return the smallest distance of facing edges, in front of each other, across a site (side 1) or outside it (-1).
+
+    It is NaN for rings with a common vertex, where the distance is 0 for some angles.
+    """
     edges = [edge[::side] for ring in _edges(polygon) for edge in ring]
+    if len({tuple(edge[0]) for edge in edges}) < len(edges):
+        return math.nan
     smallest = math.inf
     for e, f in combinations(edges, 2):
         u, v = np.subtract(e[1], e[0]), np.subtract(f[1], f[0])
@@ -96,13 +102,7 @@ def _facing_um(polygon, side, angle_limit_deg):
 
 
 def widths(layout, rules):
-    """Return widths; NaN for touching rings."""
-    measured = []
-    for i, polygon in enumerate(layout.polygons()):
-        vertices = [tuple(vertex) for ring in _edges(polygon) for vertex, _ in ring]
-        is_clear = len(set(vertices)) == len(vertices)
-        measured.append(((i,), _facing_um(polygon, 1, rules.angle_limit_deg) if is_clear else math.nan))
-    return measured
+    return [((i,), _facing_um(polygon, 1, rules.angle_limit_deg)) for i, polygon in enumerate(layout.polygons())]
 
 
 def aspect_ratios(layout, _rules):
@@ -169,7 +169,7 @@ def spaces(layout, rules):
     """Return the distances of all pairs, and the widths of notches, slits and holes."""
     pairs = combinations(enumerate(layout.polygons()), 2)
     notches = [((i,), _facing_um(polygon, -1, rules.angle_limit_deg)) for i, polygon in enumerate(layout.polygons())]
-    return [((i, j), a.distance(b)) for (i, a), (j, b) in pairs] + [n for n in notches if n[1] < math.inf]
+    return [((i, j), a.distance(b)) for (i, a), (j, b) in pairs] + [n for n in notches if n[1] != math.inf]
 
 
 def is_sliver(shape, rules):
