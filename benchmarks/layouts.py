@@ -99,8 +99,8 @@ def _against_klayout(report: Report, layout: Layout) -> None:
         },
         3,
     )
-    report.faster_than(f"minimum width, {n}", times["width"], "klayout width_check", times["k width"], 1)
-    report.faster_than(f"minimum space, {n}", times["space"], "klayout space_check", times["k space"], 1)
+    report.faster_than(f"minimum width, {n}", times["width"], "klayout width_check", times["k width"], 7)
+    report.faster_than(f"minimum space, {n}", times["space"], "klayout space_check", times["k space"], 7)
 
 
 def _against_gdstk(report: Report, what: str, layout: Layout, at_least: tuple[float, float]) -> None:

@@ -207,6 +207,40 @@ def ring_moments(xy, ring_offsets, area, moment):
         moment[ring, 1] = moment_y / 6.0 + y0 * area[ring]
 
 
+@njit(types.void(_points, _ints, types.float64, types.int8[::1]))
+def convexity(xy, ring_offsets, min_sine, sign):
+    """
+    Store the orientation of every strictly convex ring, (n_ring,): 1 or -1.
+
+    It is 1 for counter-clockwise rings, -1 for clockwise ones, and 0 for rings that are not strictly convex.
+    """
+    limit = min_sine * min_sine
+    for ring in range(sign.size):
+        first, last = ring_offsets[ring], ring_offsets[ring + 1]
+        b = last - 2 if last - first > 1 else first
+        dx, dy = xy[last - 1, 0] - xy[b, 0], xy[last - 1, 1] - xy[b, 1]
+        x, y = xy[last - 1, 0], xy[last - 1, 1]
+        square = dx * dx + dy * dy
+        is_upwards = dy > 0.0 or (dy == 0.0 and dx > 0.0)
+        n_left, n_right, n_rounds = 0, 0, 0
+        for k in range(first, last):
+            next_dx, next_dy = xy[k, 0] - x, xy[k, 1] - y
+            next_square = next_dx * next_dx + next_dy * next_dy
+            turn = dx * next_dy - dy * next_dx
+            if turn * turn > limit * square * next_square:
+                n_left += turn > 0.0
+                n_right += turn < 0.0
+            was_upwards = is_upwards
+            is_upwards = next_dy > 0.0 or (next_dy == 0.0 and next_dx > 0.0)
+            n_rounds += is_upwards and not was_upwards
+            x, y, dx, dy, square = xy[k, 0], xy[k, 1], next_dx, next_dy, next_square
+        sign[ring] = 0
+        if n_rounds == 1 and n_left == last - first:
+            sign[ring] = 1
+        elif n_rounds == 1 and n_right == last - first:
+            sign[ring] = -1
+
+
 @njit()
 def moments_below(x_a, x_b, y_a, y_b, sign):
     """Return the moments between a line from (x_a, y_a) to (x_b, y_b) and y = 0."""

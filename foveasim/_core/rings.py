@@ -28,7 +28,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.validation import Bools, Floats, Ints, read_only
+from foveasim._core.validation import Floats, Ints, read_only
 from foveasim.errors import ParameterError
 
 #: Distances of sites that differ by less than this fraction are equal: rounding of coordinates of a few millimetres.
@@ -203,25 +203,32 @@ def _sum_of_cross_products(xy_um: Floats, ring_offsets: Ints, starts: Ints, of: 
     return np.asarray(np.add.reduceat(of(x * y_after - y * x_after), starts))
 
 
-def are_convex(xy_um: Floats, ring_offsets: Ints) -> Bools:
+def convexity(xy_um: Floats, ring_offsets: Ints) -> NDArray[np.int8]:
     """
-    Return whether each ring is strictly convex, (n_ring,) bool, in either orientation.
+    Return the orientation of every strictly convex ring, (n_ring,) int8: 1 or -1.
 
+    It is 1 for counter-clockwise rings, -1 for clockwise ones, and 0 for rings that are not strictly convex.
     A closed polyline whose turning angles have one sign and add up to a single revolution is convex, and so does not intersect
     itself. Turning angles below 1e-12 rad may be rounding errors: rings with such a vertex are not counted as convex.
     """
     if ring_offsets.size == 1:
-        return np.zeros(0, bool)
+        return np.zeros(0, np.int8)
+    if xy_um.shape[0] >= KERNEL_VERTICES:
+        from foveasim._core import _kernels
+
+        sign = np.empty(ring_offsets.size - 1, np.int8)
+        _kernels.convexity(np.ascontiguousarray(xy_um), np.ascontiguousarray(ring_offsets), MIN_TURN_RAD, sign)
+        return sign
     starts, after = ring_offsets[:-1], next_vertex(ring_offsets)
     dx, dy = ((column[after] - column) for column in (xy_um[:, 0], xy_um[:, 1]))
     turn = dx * dy[after]
     turn -= dy * dx[after]
-    length = np.hypot(dx, dy)
-    min_turn = MIN_TURN_RAD * length * length[after]
-    is_left, is_right = (np.logical_and.reduceat(side, starts) for side in (turn > min_turn, turn < -min_turn))
+    square = dx * dx + dy * dy
+    is_turn = turn * turn > MIN_TURN_RAD**2 * square * square[after]
+    is_left, is_right = (np.logical_and.reduceat(is_turn & side, starts) for side in (turn > 0.0, turn < 0.0))
     is_upwards = (dy > 0.0) | ((dy == 0.0) & (dx > 0.0))
     n_rounds = np.add.reduceat((~is_upwards & is_upwards[after]).astype(np.int64), starts)
-    return np.asarray((is_left | is_right) & (n_rounds == 1))
+    return np.asarray((n_rounds == 1) * (is_left.astype(np.int8) - is_right), dtype=np.int8)
 
 
 def same_rings(one: Any, other: Any) -> bool:

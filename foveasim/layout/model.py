@@ -16,9 +16,8 @@ from foveasim._core.calls import FINITE, POSITIVE, OwnCheck
 from foveasim._core.names import CHANNEL_LETTERS, possible_names
 from foveasim._core.provenance import copy_plain_data
 from foveasim._core.rings import (
-    are_convex,
+    convexity,
     from_frame,
-    next_vertex,
     polygons_of,
     positions_in_runs,
     ring_area_um2,
@@ -832,7 +831,7 @@ def valid_sites(layout: Layout) -> Bools:
     Rings of a valid polygon do not cross, and holes lie inside the outline. Only concave outlines are passed to shapely.
     """
     outlines, n_rings = layout.site_offsets[:-1], np.diff(layout.site_offsets)
-    is_valid = (n_rings == 1) & are_convex(layout.xy_um, layout.ring_offsets)[outlines]
+    is_valid = (n_rings == 1) & (convexity(layout.xy_um, layout.ring_offsets)[outlines] != 0)
     others = np.flatnonzero(~is_valid)
     if others.size:
         is_valid[others] = shapely.is_valid(layout[others].polygons())
@@ -843,7 +842,11 @@ def without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:
     """Remove vertices equal to the next one, closing vertices included."""
     if ring_offsets.size == 1:
         return xy_um, ring_offsets
-    is_new = (xy_um != xy_um[next_vertex(ring_offsets)]).any(axis=1)
+    vertices = np.ascontiguousarray(xy_um).view(np.complex128)[:, 0]
+    is_new = np.empty(vertices.size, bool)
+    np.not_equal(vertices[:-1], vertices[1:], out=is_new[:-1])
+    last = ring_offsets[1:] - 1
+    is_new[last] = vertices[last] != vertices[ring_offsets[:-1]]
     if is_new.all():
         return xy_um, ring_offsets
     n_left = np.add.reduceat(is_new.astype(np.int64), ring_offsets[:-1])

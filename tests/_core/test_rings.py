@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from foveasim._core import _kernels
 from foveasim._core.rings import (
     KERNEL_VERTICES,
-    are_convex,
     collapse_short_edges,
+    convexity,
     next_vertex,
     positions_in_runs,
     ring_moments,
@@ -222,6 +222,15 @@ def test_positions_in_runs_restart_at_zero():
 small = st.tuples(st.integers(-4, 4), st.integers(-4, 4))
 
 
+def signs(xy_um, ring_offsets):
+    """Return the orientations of convex rings, equal with arrays and with the kernel of many vertices."""
+    found = convexity(xy_um, ring_offsets).tolist()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("foveasim._core.rings.KERNEL_VERTICES", 0)
+        assert convexity(xy_um, ring_offsets).tolist() == found
+    return found
+
+
 @given(st.lists(st.lists(small, min_size=3, max_size=7), min_size=1, max_size=6))
 @settings(max_examples=examples(400))
 def test_convex_rings_equal_their_hulls(all_rings):
@@ -232,11 +241,13 @@ def test_convex_rings_equal_their_hulls(all_rings):
     polygons = [shapely.Polygon(ring) for ring in all_rings]
     # Every vertex is a corner of the hull, without duplicates.
     expected = [
-        p.is_valid and p.convex_hull.geom_type == "Polygon" and len(p.convex_hull.exterior.coords) == len(ring) + 1
+        (1 if p.exterior.is_ccw else -1)
+        if p.is_valid and p.convex_hull.geom_type == "Polygon" and len(p.convex_hull.exterior.coords) == len(ring) + 1
+        else 0
         for p, ring in zip(polygons, all_rings, strict=True)
     ]
 
-    assert are_convex(xy_um, ring_offsets).tolist() == expected
+    assert signs(xy_um, ring_offsets) == expected
 
 
 @pytest.mark.parametrize("far_um", [0.0, 1e6])
@@ -245,14 +256,14 @@ def test_regular_polygons_are_convex(n, far_um):
     angle = 2.0 * np.pi * np.arange(n) / n
     ring = np.stack((np.cos(angle), np.sin(angle)), axis=1) + far_um
 
-    assert are_convex(ring, np.array([0, n])).all()
-    assert are_convex(ring[::-1], np.array([0, n])).all()
+    assert signs(ring, np.array([0, n])) == [1]
+    assert signs(ring[::-1], np.array([0, n])) == [-1]
 
 
 def test_pentagram_is_not_convex():
     angle = 2.0 * np.pi * 2.0 * np.arange(5) / 5
 
-    assert not are_convex(np.stack((np.cos(angle), np.sin(angle)), axis=1), np.array([0, 5])).any()
+    assert signs(np.stack((np.cos(angle), np.sin(angle)), axis=1), np.array([0, 5])) == [0]
 
 
 def test_short_edges_collapse_alike_in_all_rings():
