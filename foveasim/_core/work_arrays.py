@@ -11,6 +11,7 @@ import ctypes
 import gc
 import math
 import sys
+import time
 from contextlib import suppress
 from typing import Any
 
@@ -26,6 +27,8 @@ MIN_BYTES = 1 << 20
 HEAP_OPTIONS = {-8: 1, -3: 1 << 25, -1: (1 << 31) - 1}
 #: Limit of the unused memory that is retained; the memory that has been unused for longest is released first.
 MAX_UNUSED_BYTES = 1 << 28
+#: Seconds between returns of free pages of heaps.
+TRIM_INTERVAL_S = 5.0
 
 
 class _Memory:
@@ -96,6 +99,35 @@ def share_heap() -> None:
             library = ctypes.CDLL(None)
             for option, value in HEAP_OPTIONS.items():
                 library.mallopt(option, value)
+    _trims.interval_s = math.inf
+
+
+class _Trims:
+    """Interval of the returns of free pages, and the time of the last one."""
+
+    def __init__(self) -> None:
+        self.interval_s, self.last_s = TRIM_INTERVAL_S, time.monotonic()
+
+
+_trims = _Trims()
+
+
+def trim_heaps() -> None:
+    """
+    Return free pages of heaps to the operating system, at most once in 5 s.
+
+    Each capture calls it. The C library of GNU keeps pages between used blocks, more with each frame of another size.
+    """
+    now_s = time.monotonic()
+    if now_s - _trims.last_s >= _trims.interval_s:
+        _trims.last_s = now_s
+        _trim()
+
+
+def _trim() -> None:
+    if sys.platform.startswith("linux"):
+        with suppress(AttributeError, OSError):  # other C libraries
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def release_memory() -> None:
@@ -107,6 +139,4 @@ def release_memory() -> None:
     """
     gc.collect()
     _POOL.clear()
-    if sys.platform.startswith("linux"):
-        with suppress(AttributeError, OSError):  # other C libraries
-            ctypes.CDLL(None).malloc_trim(0)
+    _trim()

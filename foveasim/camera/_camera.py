@@ -24,6 +24,7 @@ from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property, in_order, thread_count
 from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_per_site, check_point, finite_array, read_only
+from foveasim._core.work_arrays import trim_heaps
 from foveasim.camera._clock import Clock
 from foveasim.camera._colour import colour_correction
 from foveasim.camera._exposure import AUTO_SETTINGS, ExposureTime, exposure_time
@@ -990,6 +991,7 @@ class Camera:
             raise ParameterError("light", f"must be a Scene or a PowerMap, got {type_name(light)}")
         gaze_um = self._gaze_um if moving_um is None else moving_um
         position_um = (gaze_um[0], gaze_um[1]) if self._axis == "image" else (0.0, 0.0)
+        trim_heaps()
         source, light = light, self.seen(light, gaze_um)
         e_per_j = self._sensor.responsivity_e_per_j(light.wavelength_nm)
         with clock.stage("load kernels"):

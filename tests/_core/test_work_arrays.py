@@ -4,10 +4,12 @@ import platform
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import foveasim as fs
 from foveasim._core import work_arrays
 from foveasim._core.work_arrays import release_memory, work_array
 
@@ -97,6 +99,47 @@ libc.fclose(file)
         n_heaps[name] = path.read_text().count("<heap nr=")
 
     assert n_heaps["shared"] == 1 < n_heaps["separate"]
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs the C library of GNU")
+def test_free_pages_of_the_heap_are_returned():
+    """Blocks of 16 KiB with a used one after every 64."""
+    code = """
+import resource, sys
+from foveasim._core import work_arrays
+def resident_mb():
+    return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize() / 2**20
+blocks = [bytearray(16_000) for _ in range(12_800)]
+used = blocks[::64]
+full = resident_mb()
+del blocks
+work_arrays.trim_heaps()
+early = resident_mb()
+work_arrays._trims.last_s -= work_arrays.TRIM_INTERVAL_S
+work_arrays.trim_heaps()
+print(full, early, resident_mb())
+"""
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    full, early, late = map(float, found.split())
+
+    assert early > full - 20.0  # not before the interval is over
+    assert late < full - 150.0
+
+
+@pytest.mark.parametrize("frames", ["captures", "video"])
+def test_frames_return_free_pages(monkeypatch, frames):
+    trims = []
+    monkeypatch.setattr(work_arrays, "_trim", lambda: trims.append(1))
+    monkeypatch.setattr(work_arrays._trims, "interval_s", 0.0)
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=fs.Sensor(fs.layout.grid(8, 8, 3.0)))
+    scene = fs.Scene.flat(shape=(200, 200), pitch_um=100.0, distance_m=1.0, radiance_w_m2_sr_nm=0.1, band_width_nm=10.0)
+    if frames == "video":
+        list(camera.video([scene, replace(scene, distance_m=2.0)], exposure_s=0.001, seed=0))
+    else:
+        for _ in range(2):
+            camera.capture(scene, exposure_s=0.001, seed=0)
+
+    assert len(trims) >= 2
 
 
 def test_threads_never_share_memory():
