@@ -167,7 +167,7 @@ def test_impossible_exposures_give_one_line(call, message):
 
 def test_unreachable_target_is_named():
     """A full well of 7,000 e- is less than one of 256 codes for 1.87 million electrons."""
-    sensor = fs.Sensor.from_preset(LAYOUT, "paper_read_noise")
+    sensor = fs.Sensor.from_preset(LAYOUT, "paper_read_noise", capacitance_f=1e-13)
     with pytest.raises(ParameterError, match="'target' must be a level that the sites reach"):
         sensor.exposure_for(np.full(LAYOUT.n_sites, 1e6))
 

@@ -24,7 +24,7 @@ PARENT = os.getpid()
 IN_PATTERN, MAY_END = threading.Event(), threading.Event()
 OPTICS = fs.Optics(focal_length_mm=8.0, f_number=2.8)
 SCENE = fs.Scene.flat(
-    shape=(60, 80), pitch_um=100.0, distance_m=0.5, radiance_w_m2_sr_nm=0.05, wavelength_nm=(450.0, 550.0)
+    shape=(60, 80), pitch_um=100.0, distance_m=0.5, radiance_w_m2_sr_nm=0.01, wavelength_nm=(450.0, 550.0)
 )
 
 

@@ -35,7 +35,7 @@ def scene_of(picture=PICTURE, **framing):
 
 
 def camera_of(layout=LAYOUT, optics=OPTICS, **parts):
-    return fs.Camera(optics=optics, sensor=fs.Sensor(layout), **parts)
+    return fs.Camera(optics=optics, sensor=fs.Sensor(layout, capacitance_f=1e-13), **parts)
 
 
 @pytest.mark.parametrize(("fit", "image_um"), [("cover", 30 / 200), ("contain", 40 / 300), ("width", 40 / 300)])

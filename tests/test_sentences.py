@@ -37,10 +37,10 @@ def test_uniform_scene_gives_uniform_picture():
     assert states(
         "guides/pictures.md",
         'A uniform scene gives a uniform picture of `"light_e"` per `"um2"`; codes of sites of several sizes are equal only if '
-        "their capacitances are in proportion to the areas",
+        "their capacitances are in proportion to the areas, as by default",
     )
     fixed = uniform_capture(capacitance_f=1e-14)
-    proportional = uniform_capture(capacitance_f=1.6e-16 * ZONES.area_um2)
+    proportional = uniform_capture()
 
     assert spread(fixed.picture(of="light_e", per="um2")) == pytest.approx(1.0, rel=0.02)
     assert spread(fixed.picture(of="code")) > 3.0
@@ -50,10 +50,9 @@ def test_uniform_scene_gives_uniform_picture():
 def test_sites_saturate_at_the_same_irradiance():
     assert states(
         "questions.md",
-        "With a capacitance in proportion to the area, all sites saturate at the same irradiance: `capacitance_f=1.6e-16 * "
-        "layout.area_um2`",
+        "The default, `1.5e-16 * layout.area_um2`, gives 2,809 e⁻ per µm² at 3 V: all sites saturate at the same irradiance",
     )
-    sensor = fs.Sensor(ZONES, capacitance_f=1.6e-16 * ZONES.area_um2, bits=10)
+    sensor = fs.Sensor(ZONES, bits=10)
     # The irradiance in e-/µm² above which the largest site has the highest code.
     largest = ZONES.area_um2.argmax()
     levels = np.linspace(2000.0, 4000.0, 401)
@@ -62,6 +61,7 @@ def test_sites_saturate_at_the_same_irradiance():
 
     assert 0 < first[largest] < levels.size - 1
     assert np.ptp(first) <= 1
+    assert levels[first[largest]] == pytest.approx(2809.0, rel=3e-3)
 
 
 def test_volumes_are_those_of_a_part():

@@ -31,6 +31,7 @@ NOISE = {
     "rts_fraction": 0.01,
     "rts_e": 5.0,
     "dnl_dn": 0.2,
+    "capacitance_f": 1e-13,
     "bits": 12,
 }
 

@@ -30,7 +30,7 @@ FIELD_MARGIN = 1.04
 DEFAULT_FOCAL_MM, DEFAULT_F_NUMBER, DEFAULT_DISTANCE_M = 8.0, 2.8, 1.0
 DEFAULT_RADIANCE_W_M2_SR_NM, DEFAULT_WAVELENGTH_NM, DEFAULT_BAND_NM = 0.008, 550.0, 100.0
 DEFAULT_EXPOSURE_S = 1 / 60
-CAPACITANCE_F_PER_UM2, READ_NOISE_E, QE, BITS = 1.5e-16, 2.0, 0.6, 10
+READ_NOISE_E, QE, BITS = 2.0, 0.6, 10
 
 
 def default_sensor(layout: Layout) -> Sensor:
@@ -50,9 +50,7 @@ def default_sensor(layout: Layout) -> Sensor:
     >>> sensor.bits, sensor.filter_names
     (10, ('all',))
     """
-    return Sensor(
-        layout, qe=QE, capacitance_f=CAPACITANCE_F_PER_UM2 * layout.area_um2, read_noise_e=READ_NOISE_E, bits=BITS
-    )
+    return Sensor(layout, qe=QE, read_noise_e=READ_NOISE_E, bits=BITS)
 
 
 def default_optics() -> Optics:

@@ -353,7 +353,7 @@ def _sensor() -> type[Section]:
         dark_e_per_s=_PerSite,
         full_well_e=_PerSite | None,
         read_noise_e=_PerSite,
-        capacitance_f=_PerSite,
+        capacitance_f=_PerSite | None,
         effects=list[_union_of("kind", effects)] if effects else list[Any],  # type: ignore[misc]
         disabled=list[str],
     )

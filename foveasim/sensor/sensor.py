@@ -94,6 +94,8 @@ __all__ = ["PerSite", "Photosites", "Sensor"]
 OFFSET_SIGMAS, SMALLEST_NOISE = 0.05, 1e-9
 #: Fraction of its own charge that a site keeps in a mixing, above which this charge has its own distribution in predictions.
 MIN_OWN_FRACTION = 0.5
+#: Default of the capacitance per area of a site: 2,809 e-/µm² at 3 V.
+CAPACITANCE_F_PER_UM2 = 1.5e-16
 #: Parameters that depend on the wavelength, which the settings of captures do not restore.
 SPECTRAL = ("qe", "filters")
 #: One value for all sites, or an array (n_site,).
@@ -163,8 +165,9 @@ class Sensor:
         Standard deviation of the Gaussian read noise.
     rts_fraction, rts_e : float
         Random telegraph (RTS) noise: fraction of affected sites, and difference between their two states, e-.
-    capacitance_f : float or (n_site,), F
-        Capacitance of the sense node: 1e-13 F in the paper's foveal run.
+    capacitance_f : float or (n_site,), F, optional
+        Capacitance of the sense node; by default 1.5e-16 F per µm² of the area of a site, so that all sites saturate at equal
+        irradiances: at 2,809 e-/µm² for 3 V. The paper's foveal run has 1e-13 F for all sites.
     gain_fpn_fraction : float
         Gain FPN: standard deviation over mean of the conversion gain, a Gaussian distribution.
     nonlinearity_fraction : float
@@ -231,8 +234,8 @@ class Sensor:
     rts_fraction: Annotated[float, SHARE, Usual(0.0, 0.1)] = 0.0
     rts_e: Annotated[float, NOISE] = 0.0
     capacitance_f: Annotated[
-        PerSite, Limits(above=0.0, low=1e-18, at_most=1e-6, hint="capacitances are in farad: 1 fF is 1e-15")
-    ] = 1e-13
+        PerSite | None, Limits(above=0.0, low=1e-18, at_most=1e-6, hint="capacitances are in farad: 1 fF is 1e-15")
+    ] = None
     gain_fpn_fraction: Annotated[float, SPREAD] = 0.0
     nonlinearity_fraction: Annotated[
         float, Limits(at_least=0.0, at_most=0.5, hint="above 0.5 the voltage would decrease with charge")
@@ -628,8 +631,7 @@ class Sensor:
     @cached_property
     def sites(self) -> Sites:
         """Photosites with device and sense-node capacitances, for effects."""
-        capacitance_f = read_only(np.atleast_1d(np.asarray(self.capacitance_f, np.float64)).copy())
-        return Sites(self.layout, self.device, capacitance_f, _complete=self._complete_sites)
+        return Sites(self.layout, self.device, self.node_f, _complete=self._complete_sites)
 
     @property
     def _complete_sites(self) -> tuple[Sites, slice | Ints] | None:
@@ -756,9 +758,15 @@ class Sensor:
         )
 
     @cached_property
+    def node_f(self) -> Floats:
+        """Capacitance of the sense nodes, (n_site,) or (1,) F: as given, or by area."""
+        given = CAPACITANCE_F_PER_UM2 * self.layout.area_um2 if self.capacitance_f is None else self.capacitance_f
+        return read_only(np.atleast_1d(np.array(given, np.float64)))
+
+    @cached_property
     def v_per_e(self) -> Floats:
         """Nominal conversion gain at zero signal, (n_site,) or (1,) V/e-."""
-        return read_only(np.atleast_1d(electrons_to_volts(1.0, self.capacitance_f)))
+        return read_only(electrons_to_volts(1.0, self.node_f))
 
     @cached_property
     def well_e(self) -> Floats:

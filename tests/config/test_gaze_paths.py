@@ -25,7 +25,7 @@ SETTINGS = {
     },
     "optics": {"focal_length_mm": 22.0, "f_number": 4.0},
     "layout": {"generator": "hexagonal", "parameters": {"n_columns": 12, "n_rows": 10, "pitch_um": 5.0}},
-    "sensor": {"read_noise_e": 3.0, "bits": 12},
+    "sensor": {"read_noise_e": 3.0, "bits": 12, "capacitance_f": 1e-13},
     "exposure_s": 0.01,
     "seed": 1,
 }  # fmt: skip

@@ -27,7 +27,7 @@ SHOT = {
     },
     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
     "layout": {"generator": "grid", "parameters": {"n_x": 12, "n_y": 10, "pitch_um": 4.0}},
-    "sensor": {"bits": 10},
+    "sensor": {"bits": 10, "capacitance_f": 1e-13},
     "exposure_s": 0.01,
     "seed": 7,
 }

@@ -469,7 +469,7 @@ def camera():
         relative_illumination=np.linspace(0.8, 1.0, 9)[:, np.newaxis],
     )
     layout = fs.layout.grid(n_x=16, n_y=16, pitch_um=1.5)
-    return fs.Camera(optics=with_psfs(psfs, lens), sensor=fs.Sensor(layout))
+    return fs.Camera(optics=with_psfs(psfs, lens), sensor=fs.Sensor(layout, capacitance_f=1e-13))
 
 
 @pytest.mark.filterwarnings("ignore::foveasim.errors.CoverageWarning")

@@ -41,7 +41,7 @@ PSFS = optics.PSFGrid(
     wavelength_nm=np.array([550.0]),
     pitch_um=1.0,
 )
-SENSOR = fs.Sensor(SITES, read_noise_e=np.full(SITES.n_sites, 2.0))
+SENSOR = fs.Sensor(SITES, read_noise_e=np.full(SITES.n_sites, 2.0), capacitance_f=1e-13)
 CAMERA = fs.Camera(optics=OPTICS, sensor=SENSOR)
 GRID = fs.Grid((100, 200), 0.5)
 SCENE = fs.Scene.flat(
@@ -72,7 +72,7 @@ SHOT = {
     },
     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
     "layout": {"generator": "grid", "parameters": {"n_x": 40, "n_y": 40, "pitch_um": 2.0}},
-    "sensor": {},
+    "sensor": {"capacitance_f": 1e-13},
     "exposure_s": 0.01,
 }
 

@@ -540,7 +540,7 @@ PHOTOGRAPH = fs.Scene.from_picture(
 
 
 def camera_of(layout, pixel_optics, **options):
-    sensor = fs.Sensor(layout, pixel_optics=pixel_optics, read_noise_e=2.0, prnu_fraction=0.01)
+    sensor = fs.Sensor(layout, pixel_optics=pixel_optics, read_noise_e=2.0, prnu_fraction=0.01, capacitance_f=1e-13)
     return fs.Camera(optics=lens(exit_pupil_mm=1.0, precision="double"), sensor=sensor, **options)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import scipy.constants
 
 import foveasim as fs
 from foveasim.errors import ParameterError, SimulationError
-from foveasim.layout import grid
+from foveasim.layout import Layout, grid
 from foveasim.sensor import ConstantCurve, FilterSet, Sensor, SiliconQE, draw_shot_noise
 
 #: Number of sites for statistics to 0.3 %.
@@ -251,11 +252,23 @@ def test_read_noise_is_per_site():
 
 
 def test_code_width_matches_published_7314_electrons():
-    assert codes([7314, 7315, 14_628, 14_629]).tolist() == [0, 1, 1, 2]
+    assert codes([7314, 7315, 14_628, 14_629], capacitance_f=1e-13).tolist() == [0, 1, 1, 2]
 
 
 def test_saturation_charge_matches_published_value():
-    assert codes([1_865_000, 1_870_000]).tolist() == [254, 255]
+    assert codes([1_865_000, 1_870_000], capacitance_f=1e-13).tolist() == [254, 255]
+
+
+def test_default_capacitance_follows_area():
+    sizes_um = np.array([[1.0, 1.0], [2.0, 3.0], [8.0, 8.0]])
+    sensor = Sensor(Layout.from_rectangles([[0.0, 0.0], [10.0, 0.0], [30.0, 0.0]], sizes_um), bits=12, shot_noise="off")
+    per_um2 = 3.0 * 1.5e-16 / scipy.constants.e  # full well
+
+    for level, code in ((0.25, 1024), (0.5, 2048), (0.999, 4091)):
+        found = sensor.read(np.ceil(level * per_um2 * sizes_um.prod(axis=1)).astype(int), seed=0)
+        assert np.abs(found.astype(int) - code).max() <= 2
+    few = replace(sensor, layout=sensor.layout[1:])
+    assert few.v_per_e.tolist() == sensor.v_per_e[1:].tolist()
 
 
 @pytest.mark.parametrize("bits", [4, 8, 12])
@@ -279,7 +292,7 @@ def test_every_code_occurs_at_its_centre(bits):
 @pytest.mark.parametrize("bits", range(1, 17))
 @pytest.mark.parametrize("read_noise_e", [0.0, 10.0])
 def test_codes_are_clipped_to_range(bits, read_noise_e):
-    full_e = charge_for(3.0, 1e-13)
+    full_e = charge_for(3.0, 6e-16)
     charge_e = np.array([-(2**62), -1, 0, full_e - 1, full_e, full_e + 1, 2 * full_e, 2**40, 2**63 - 1])
     code = codes(charge_e, bits=bits, read_noise_e=read_noise_e).astype(int)
     assert code.min() == code[0] == 0
@@ -295,7 +308,7 @@ def test_extreme_charges_give_highest_code(how, expected_e):
 
 
 def test_codes_are_monotonic_in_charge():
-    code = codes(np.linspace(0, 2.2e6, 5000), bits=10).astype(int)
+    code = codes(np.linspace(0, 13e3, 5000), bits=10).astype(int)
     assert np.all(np.diff(code) >= 0)
 
 
@@ -310,7 +323,7 @@ def test_double_capacitance_halves_code():
 
 
 def test_double_voltage_range_halves_code():
-    low, high = (int(codes([1_000_000], bits=16, v_sat_v=v)[0]) for v in (3.0, 6.0))
+    low, high = (int(codes([6_000], bits=16, v_sat_v=v)[0]) for v in (3.0, 6.0))
     assert abs(low - 2 * high) <= 1
 
 

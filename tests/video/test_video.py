@@ -1327,6 +1327,7 @@ SHOT = """
 scene: {kind: picture, picture: photo.png, pitch_um: 100, distance_m: 1.0, peak_radiance_w_m2_sr_nm: 0.2}
 optics: {focal_length_mm: 8, f_number: 2.8}
 layout: {generator: grid, parameters: {n_x: 20, n_y: 20, pitch_um: 3}}
+sensor: {capacitance_f: 1.0e-13}
 exposure_s: 0.01
 """
 

@@ -93,7 +93,7 @@ SECTIONS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 #: Initial values per µm² by parameter.
 PER_AREA: dict[str, float] = {
-    "capacitance_f": 1e-15,
+    "capacitance_f": 1.5e-16,
     "dark_e_per_s": 10.0,
     "full_well_e": 2000.0,
     "read_noise_e": 0.05,

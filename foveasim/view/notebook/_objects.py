@@ -160,7 +160,7 @@ def _sensor_facts(sensor: Sensor) -> dict[str, object]:
         "filters": ", ".join(sensor.filter_names),
         "quantum efficiency": format_field(sensor.qe),
         "sensitivity": "" if np.all(np.asarray(sensor.sensitivity) == 1.0) else _describe("", sensor.sensitivity),
-        "capacitance": _describe("capacitance_f", sensor.capacitance_f),
+        "capacitance": _describe("capacitance_f", sensor.node_f),
         "full well": top,
         "saturation voltage": format_quantity(sensor.v_sat_v, "V"),
         "pedestal": format_quantity(sensor.pedestal_v, "V") if sensor.pedestal_v else "",
@@ -200,7 +200,7 @@ def _describe(name: str, value: Any) -> str:
     if isinstance(value, np.ndarray) and value.size > 1 and value.dtype.kind in "iuf":
         return format_quantity([float(value.min()), float(value.max())], unit)
     if isinstance(value, float | np.floating | np.ndarray) and np.size(value) == 1:
-        return format_quantity(float(value), unit, digits=6)
+        return format_quantity(float(np.asarray(value).item()), unit, digits=6)
     text = format_field(value)
     return f"{text} {unit}" if unit else text
 
