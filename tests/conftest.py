@@ -24,12 +24,12 @@ import pytest
 from browsers import CHROMIUM, open_chromium
 from effort import commit, effort, examples, is_in_part
 
-from foveasim import compile_kernels
-
 # Bytecode is stored next to the sources, as is the machine code of kernels, even where the environment disables it: the tests start
 # hundreds of processes, and each would compile the package.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# As many processes as cores run tests: further threads of the linear algebra would only wait for each other, at full load.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Background jobs of shells ignore SIGINT, and so would the programs that the tests start and interrupt.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -83,6 +83,8 @@ def pytest_configure(config):
     )
     hypothesis.settings.load_profile("foveasim")
     if not is_worker and getattr(config.option, "numprocesses", None):
+        from foveasim import compile_kernels
+
         compile_kernels()
 
 
@@ -135,8 +137,14 @@ def pytest_collection_modifyitems(config, items):
             kept = {item for item in sets if any(part in item.name for part in keep)}
         dropped.update(set(sets) - kept)
     if effort() == "all":
-        of_night = [item for item in items if item in dropped and item.get_closest_marker("nightly")]
-        dropped = {item for k, item in enumerate(of_night) if not is_in_part(k, commit())}
+        of_night = {item: item.get_closest_marker("nightly") for item in items if item in dropped}
+        groups: dict[object, int] = {}
+        number = {
+            item: groups.setdefault(marker.kwargs.get("group", item), len(groups))
+            for item, marker in of_night.items()
+            if marker is not None
+        }
+        dropped = {item for item, k in number.items() if not is_in_part(k, commit())}
     config.hook.pytest_deselected(items=list(dropped))
     items[:] = [item for item in items if item not in dropped]
 

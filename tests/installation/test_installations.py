@@ -13,7 +13,8 @@ from foveasim.cli import app
 from installation.calls import CALLS, COMMANDS, failures, required_extra
 from installation.environments import make_environment, run_calls
 
-pytestmark = pytest.mark.slow
+# Without extras, the target test-core does the same.
+pytestmark = pytest.mark.nightly(group="installations")
 
 #: Extras with modules that the package imports.
 EXTRAS = sorted(set(EXTRA_OF.values()))
@@ -68,7 +69,6 @@ def test_core_installation_works_or_names_extra(core):
     assert len(required) < len(core) / 3
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize(
     "extra",
     [pytest.param(extra, marks=[pytest.mark.needs(what) for what in BEYOND_DEV.get(extra, ())]) for extra in EXTRAS],
