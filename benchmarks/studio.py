@@ -28,7 +28,20 @@ from foveasim.studio._messages import decode_part
 N_CHANGES, N_QUICK = 50, 5
 #: Sensors by number of photosites: settings that differ from the demo.
 SENSORS: dict[str, dict[str, Any]] = {
-    "14,208": {},
+    "14,208": {
+        "layout": {
+            "generator": "log_polar",
+            "parameters": {
+                "n_sectors": 192,
+                "min_size_um": 2.0,
+                "r_max_um": 690.0,
+                "stagger": True,
+                "chords_per_arc": 2,
+            },
+            "mosaic": ["RG", "GB"],
+            "rules": {"min_size_um": 2.0, "min_width_um": 1.9, "angle_limit_deg": 25.0, "max_overlap_um2": 0.0},
+        },
+    },
     "200,000": {
         "layout": {
             "generator": "log_polar",

@@ -147,7 +147,7 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
     >>> path = fs.config.demo_settings()[0]
     >>> shot = fs.config.read_shot(path, ["optics.f_number=4", "exposure_s=0.002"])
     >>> shot.camera.optics.f_number, shot.camera.sensor.layout.n_sites, shot.requested_s
-    (4.0, 14208, 0.002)
+    (4.0, 9631, 0.002)
     """
     source = Source(file=Path(path), replaced={change.partition("=")[0].strip(): CHANGE for change in changes})
     return build_shot(source, read_settings(path, changes), n_threads=n_threads)

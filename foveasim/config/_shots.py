@@ -20,6 +20,7 @@ from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import FileError, printable
 from foveasim.layout import Layout, Report
+from foveasim.reconstruct.picture import NO_DATA_COLOUR
 from foveasim.view import hidden_figures, plot_capture, prisms, render, save_figure
 from foveasim.view.renderer import missing_software
 
@@ -90,7 +91,7 @@ def write_results(shot: Shot, capture: Capture, directory: str | Path) -> tuple[
         raise FileError(directory, f"cannot be created: {error.strerror or error}") from None
     paths = [directory / f"{shot.name}_{part}" for part in ("picture.png", "layout.png", "capture.npz")]
     with atomic_files(*paths) as (picture, layout, saved):
-        capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn)
+        capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn, background=NO_DATA_COLOUR)
         with hidden_figures():
             axes = plot_capture(capture)
         axes.set_title(f"{printable(shot.name)}: {capture.layout.n_sites} photosites", parse_math=False)

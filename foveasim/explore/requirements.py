@@ -110,8 +110,8 @@ def measure(result: RegionResult, shot: Shot, capture: Capture) -> float:
     >>> import foveasim as fs
     >>> shot = fs.config.read_shot(fs.config.demo_settings()[0])
     >>> capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=0)
-    >>> round(fs.explore.measure(fs.config.RegionResult(measure="smallest_size_um"), shot, capture), 3)
-    2.0
+    >>> round(fs.explore.measure(fs.config.RegionResult(measure="smallest_size_um"), shot, capture), 1)
+    6.0
     """
     sites = sites_of(result, capture.layout)
     if not sites.size:

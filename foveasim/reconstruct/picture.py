@@ -36,8 +36,8 @@ NO_COVERAGE, COMPLETE = 1e-9, 1e-6
 MAX_CACHED: tuple[tuple[int, int], ...] = ((2, 1 << 18), (1, 1 << 20))
 #: Whether gaps between neighbours, such as trenches, are drawn.
 Gaps: TypeAlias = Literal["fill", "empty"]
-#: Colour of pixels without photosites in formats without alpha.
-NO_DATA_COLOUR = "white"
+#: Colour of pixels without photosites in formats without alpha: neither black nor white, which saturated sites have.
+NO_DATA_COLOUR = (185, 196, 214)
 #: A name or code of HTML, such as "white" or "#204060", or red, green and blue from 0 to 255.
 Colour: TypeAlias = str | Sequence[int]
 _Made = TypeVar("_Made")
@@ -185,7 +185,7 @@ class Picture:
         -------
         image : (n_y, n_x, 2 or 4) or, with a background, (n_y, n_x, 1 or 3), uint8 or uint16
             Grey or RGB as of :meth:`to_rgb`, with the coverage as alpha. With a background there is no alpha; a grey picture on
-            a background of another colour becomes RGB.
+            a background of another colour becomes RGB, unless photosites cover all pixels.
 
         Raises
         ------
@@ -201,7 +201,9 @@ class Picture:
         if background is None:
             layers = np.concatenate((fraction, coverage))
         else:
-            layers = coverage * fraction + (1.0 - coverage) * _channels(background, fraction.shape[0])
+            colour = _channels(background, fraction.shape[0])
+            is_complete = bool(np.all(coverage >= 1.0 - COMPLETE))
+            layers = fraction if is_complete else coverage * fraction + (1.0 - coverage) * colour
         image: NDArray[Any] = np.rint((2**bits - 1) * to_file_rows(layers))
         return np.ascontiguousarray(image.astype(np.uint8 if bits == 8 else np.uint16))
 
@@ -230,8 +232,8 @@ class Picture:
             32 writes floating-point numbers, with NaN where no photosite lies and without alpha. By default 32 for TIFF and
             EXR, and 8 for other formats.
         background : str or (r, g, b), optional
-            As for :meth:`to_image`; white by default in formats without alpha. In floating-point files its linear value, where
-            1 is ``white``, replaces NaN and is mixed with partly covered pixels.
+            As for :meth:`to_image`; a pale blue, (185, 196, 214), by default in formats without alpha. In floating-point files
+            its linear value, where 1 is ``white``, replaces NaN and is mixed with partly covered pixels.
 
         Raises
         ------

@@ -15,6 +15,7 @@ from foveasim._core.validation import UNIT_SUFFIXES, Floats, Ints, as_numbers, f
 from foveasim.capture import Capture
 from foveasim.errors import ParameterError, type_name
 from foveasim.layout import Layout
+from foveasim.reconstruct.picture import NO_DATA_COLOUR
 from foveasim.units import decode_srgb, encode_srgb
 
 __all__ = [
@@ -53,8 +54,8 @@ CATEGORY_COLOURS: tuple[Rgb, ...] = (
 )  # fmt: skip
 #: Pale shades of sites without values; neighbours mostly differ.
 SHADES: tuple[Rgb, ...] = ((222, 226, 232), (202, 209, 218), (232, 228, 219), (212, 219, 212), (236, 236, 238))
-#: Areas without photosites: neither black nor white.
-BACKGROUND: Rgb = (185, 196, 214)
+#: Areas without photosites, as in picture files.
+BACKGROUND: Rgb = NO_DATA_COLOUR
 #: Boundaries between sites.
 BOUNDARY: Rgb = (64, 64, 64)
 #: Sites without a value (NaN): in none of the colour maps in use.

@@ -22,7 +22,10 @@ from foveasim import config
 from foveasim._io.atomic import atomic_write
 from foveasim._io.images import read_picture
 from foveasim.config import bundled_layouts
+from foveasim.reconstruct.picture import NO_DATA_COLOUR
 from foveasim.view import find_renderer
+
+REPOSITORY = Path(__file__).parents[2]
 
 SHOT = """
 scene: {kind: picture, picture: photo.png, pitch_um: 100, distance_m: 1.0, peak_radiance_w_m2_sr_nm: 0.2}
@@ -58,30 +61,46 @@ def test_demo_writes_pictures_and_table(foveasim, tmp_path):
     if find_renderer() is not None:
         names.append("foveal_3d.png")
     assert sorted(p.name for p in out.iterdir()) == sorted(names)
-    for word in ("14,208", "13,312", "blind-spot radius", "60.12", "saturated", "optics / s"):
+    assert "Warning" not in result.stdout + result.stderr
+    for word in ("9,631", "11,700", "saturated", "optics / s"):
         assert word in result.stdout
-    check_upright_picture_with_blind_spot(out)
+    check_upright_picture(out / "foveal", "astronaut", 760.0)
 
 
-def check_upright_picture_with_blind_spot(out):
+@pytest.mark.slow
+def test_run_of_the_paper_fills_its_range(foveasim, tmp_path):
+    result = foveasim("run", str(REPOSITORY / "gallery" / "paper_foveal.yaml"), "-o", str(tmp_path), cwd=REPOSITORY)
+
+    assert result.returncode == 0, result.stderr
+    assert "Warning" not in result.stdout + result.stderr
+    assert "blind-spot radius / µm" in result.stdout
+    code = fs.Capture.load(tmp_path / "paper_foveal_capture.npz").code
+    assert 200 < np.percentile(code, 95) < 255
+    assert np.mean(code == 255) < 0.02
+    check_upright_picture(tmp_path / "paper_foveal", "camera", 500.0)
+    picture = read_picture(tmp_path / "paper_foveal_picture.png")
+    assert (picture[[0, 512], [0, 512]] == NO_DATA_COLOUR).all()  # outside the sensor, and in its blind spot
+
+
+def check_upright_picture(results, photograph, pitch_um):
     """The picture correlates with the photograph, and not with its mirror images."""
-    seen = read_picture(out / "foveal_picture.png").astype(float)
-    capture = fs.Capture.load(out / "foveal_capture.npz")
-    photograph = read_picture(str(files("skimage.data") / "astronaut.png")).astype(float)
-    # Position of each pixel in the photograph: 500 µm per pixel, 8 mm lens at 1 m, axis at the centre.
-    cell_um = 500.0 * 8 / (1000 - 8)
+    seen = read_picture(results.with_name(f"{results.name}_picture.png")).astype(float)
+    capture = fs.Capture.load(results.with_name(f"{results.name}_capture.npz"))
+    photograph = read_picture(str(files("skimage.data") / f"{photograph}.png")).astype(float)
+    photograph = photograph.reshape(512, 512, -1)
+    # Position of each pixel in the photograph: 8 mm lens at 1 m, axis at the centre.
+    cell_um = pitch_um * 8 / (1000 - 8)
     grid, (gaze_x_um, gaze_y_um) = capture.picture(max_pixels=1024).grid, capture.settings["gaze_um"]
     column = np.clip(np.round((grid.x_um + gaze_x_um) / cell_um + 255.5).astype(int), 0, 511)
     row = np.clip(np.round(255.5 - (grid.y_um[::-1] + gaze_y_um) / cell_um).astype(int), 0, 511)
-    is_seen = seen[..., 3] == 255
+    is_seen = np.any(seen != NO_DATA_COLOUR, axis=2)
 
     def likeness(picture):
         expected = picture[np.ix_(row, column)]
         return np.corrcoef(seen[..., 0][is_seen], expected[..., 0][is_seen])[0, 1]
 
     assert likeness(photograph) > 0.9
-    assert max(likeness(photograph[::-1]), likeness(photograph[:, ::-1])) < 0.5
-    assert not seen[505:519, 505:519, 3].any()
+    assert max(likeness(photograph[::-1]), likeness(photograph[:, ::-1])) < 0.6
 
 
 @pytest.mark.slow

@@ -32,6 +32,7 @@ from foveasim.reconstruct import (
     raster_grid,
     reference,
 )
+from foveasim.reconstruct.picture import NO_DATA_COLOUR
 
 FOVEAL = fs.layout.log_polar(n_sectors=40, min_size_um=2.0, r_max_um=80.0, stagger=True)
 HEXAGONS = fs.layout.hexagonal(n_columns=14, n_rows=15, pitch_um=3.0)
@@ -769,17 +770,17 @@ def test_background_equals_composition_by_pillow(n_channels, encode_srgb, backgr
 @pytest.mark.parametrize(
     ("name", "tolerance"), [("p.bmp", 0), ("p.ppm", 0), ("p.jpg", 20), ("p.jpeg", 20), ("p.gif", 0)]
 )
-def test_formats_without_alpha_are_white_outside(tmp_path, n_channels, name, tolerance):
+def test_formats_without_alpha_are_pale_blue_outside(tmp_path, n_channels, name, tolerance):
     picture = asymmetric(n_channels)
     smooth = np.linspace(0.4, 1.6, picture.data.size).reshape(picture.data.shape).astype(np.float32)
     picture = Picture(np.where(np.isnan(picture.data), np.nan, smooth), picture.coverage, picture.grid)
     picture.save(tmp_path / name, 2.0)
     read = np.atleast_3d(read_picture(tmp_path / name)).astype(int)
-    expected = composed_by_pillow(picture, "white")[..., : read.shape[2]]
+    expected = composed_by_pillow(picture, NO_DATA_COLOUR)
 
     assert np.abs(np.broadcast_to(read, expected.shape) - expected)[:2].max() <= tolerance
     if tolerance == 0:
-        assert (read[-2, 2] == 255).all()
+        assert (read[-2, 2] == NO_DATA_COLOUR).all()
 
 
 @pytest.mark.parametrize("name", ["p.png", "p.webp", "p.jp2", "p.tga"])
