@@ -157,6 +157,10 @@ FLAT = np.full(16, 100.0)
         lambda value: SENSOR.calibrate(exposure_s=0.01, flat_e=FLAT, n_frames=4, seed=0).correct(np.full(16, value)),
         lambda value: fs.distortion.read_calibration("a.yaml", pixel_um=3.0, focal_um=value),
         lambda value: LAYOUT.plot(figure_inches=value),
+        lambda value: fs.sensor.Footprints(np.full(16, value), LAYOUT),
+        lambda value: fs.modes.Shutter(LAYOUT.with_columns(readout_order=np.full(16, value)), frame_s=0.01, line_s=1e-5),
+        lambda value: fs.reconstruct.fill_channels(LAYOUT, np.full(16, value), np.zeros(16, int), 1),
+        lambda value: fs.reconstruct.fill_channels(LAYOUT, FLAT, np.full(16, value), 1),
     ],
 )  # fmt: skip
 def test_infinite_values_are_rejected(call, value):

@@ -73,6 +73,8 @@ class Shutter:
                 "a rolling shutter needs the line of each site; add a column 'readout_order' to the layout, for example with "
                 "foveasim.layout.readout_by or nearest_bus"
             )
+        if self.line_s:
+            finite_array("readout_order", self.layout.columns["readout_order"])
 
     @property
     def delay_s(self) -> Floats:

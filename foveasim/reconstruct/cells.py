@@ -9,7 +9,7 @@ import numpy as np
 from foveasim._core.calls import Limits
 from foveasim._core.rings import TIE_FRACTION, site_moments
 from foveasim._core.threads import thread_count
-from foveasim._core.validation import Floats, Ints, as_numbers, check_memory, check_per_site, finite_array
+from foveasim._core.validation import Floats, Ints, check_memory, check_per_site, finite_array
 from foveasim.fields import Grid, PackedRings
 from foveasim.reconstruct.picture import Gaps, Picture, cached_by_layout, raster_of
 
@@ -69,7 +69,9 @@ def fill_channels(
     ----------
     layout : Layout
     values : (n_site,)
+        Finite numbers.
     channel : (n_site,) int
+        From 0 to ``n_channels - 1``.
     n_channels : int
 
     Returns
@@ -79,6 +81,11 @@ def fill_channels(
         inverse distance. Further sites at the distance of the fourth are included, so that the result does not depend on the
         order of the sites. NaN for a channel without sites.
 
+    Raises
+    ------
+    ParameterError
+        When values or channels are not such numbers, or there is not one of each for each site.
+
     Examples
     --------
     >>> import foveasim as fs
@@ -87,12 +94,13 @@ def fill_channels(
     >>> fs.reconstruct.fill_channels(layout, np.array([1.0, 2.0, 3.0, 4.0]), layout.channel, 3).tolist()
     [[1.0, 1.0, 1.0, 1.0], [2.5, 2.0, 3.0, 2.5], [4.0, 4.0, 4.0, 4.0]]
     """
-    values = as_numbers("values", values)
+    values = finite_array("values", values)
     n_sites = layout.site_offsets.size - 1
     check_per_site("values", values, n_sites)
     check_per_site("channel", np.asarray(channel), n_sites)
+    channel = finite_array("channel", channel, at_least=0, at_most=n_channels - 1).astype(np.int32)
     check_memory("n_channels", 8 * n_channels * n_sites, n_channels, "take fewer channels")
-    neighbours = _neighbours(layout, np.asarray(channel, np.int32).tobytes(), n_channels)
+    neighbours = _neighbours(layout, channel.tobytes(), n_channels)
     filled = np.full((n_channels, values.size), np.nan)
     for c, (own, others, mean_of) in neighbours.items():
         filled[c, own] = values[own]
