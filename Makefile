@@ -11,6 +11,8 @@ PYTEST_ARGS ?=
 # Bytecode is stored next to the sources, even where the environment disables it: each process would compile the package and its tests.
 unexport PYTHONDONTWRITEBYTECODE
 PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
+# Slow tests often wait for other programs and for browsers: one process more than there are cores, at most five.
+WAITING := $(PARALLEL) --numprocesses $(shell n=$$(getconf _NPROCESSORS_ONLN) && echo $$((n < 4 ? n + 1 : 5)))
 
 # Lower bounds of pyproject.toml on the oldest Python: .venv-lowest/uv resolves them, .venv-lowest/env contains them.
 LOWEST := .venv-lowest
@@ -46,11 +48,11 @@ test-core:
 # The slow tests, too, those in a browser, all pairs of features and invariants in tests/compositions instead of a sample, and a third
 # of the tests marked nightly, which FOVEASIM_TESTS_COMMIT selects.
 test-all: $(VENV)/.installed-dev
-	FOVEASIM_TESTS=all $(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
+	FOVEASIM_TESTS=all $(BIN)/python -m pytest $(WAITING) $(PYTEST_ARGS)
 
 # All tests, with all of those marked nightly, and all invariants for all pairs of features.
 test-nightly: $(VENV)/.installed-dev
-	FOVEASIM_TESTS=nightly $(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
+	FOVEASIM_TESTS=nightly $(BIN)/python -m pytest $(WAITING) $(PYTEST_ARGS)
 
 # All tests in a browser.
 test-pages: $(VENV)/.installed-dev
