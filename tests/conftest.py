@@ -28,7 +28,7 @@ from effort import commit, effort, examples, is_in_part
 # hundreds of processes, and each would compile the package.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-# As many processes as cores run tests: further threads of the linear algebra would only wait for each other, at full load.
+# At least as many processes as cores run tests: threads of the linear algebra would only wait for each other, at full load.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Background jobs of shells ignore SIGINT, and so would the programs that the tests start and interrupt.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:

@@ -94,8 +94,6 @@ __all__ = ["PerSite", "Photosites", "Sensor"]
 OFFSET_SIGMAS, SMALLEST_NOISE = 0.05, 1e-9
 #: Fraction of its own charge that a site keeps in a mixing, above which this charge has its own distribution in predictions.
 MIN_OWN_FRACTION = 0.5
-#: Default of the capacitance per area of a site: 2,809 e-/µm² at 3 V.
-CAPACITANCE_F_PER_UM2 = 1.5e-16
 #: Parameters that depend on the wavelength, which the settings of captures do not restore.
 SPECTRAL = ("qe", "filters")
 #: One value for all sites, or an array (n_site,).
@@ -631,7 +629,10 @@ class Sensor:
     @cached_property
     def sites(self) -> Sites:
         """Photosites with device and sense-node capacitances, for effects."""
-        return Sites(self.layout, self.device, self.node_f, _complete=self._complete_sites)
+        given_f = None if self.capacitance_f is None else np.atleast_1d(np.array(self.capacitance_f, np.float64))
+        return Sites(
+            self.layout, self.device, None if given_f is None else read_only(given_f), _complete=self._complete_sites
+        )
 
     @property
     def _complete_sites(self) -> tuple[Sites, slice | Ints] | None:
@@ -757,11 +758,10 @@ class Sensor:
             diffusion_fraction=self.dark_diffusion_fraction,
         )
 
-    @cached_property
+    @property
     def node_f(self) -> Floats:
         """Capacitance of the sense nodes, (n_site,) or (1,) F: as given, or by area."""
-        given = CAPACITANCE_F_PER_UM2 * self.layout.area_um2 if self.capacitance_f is None else self.capacitance_f
-        return read_only(np.atleast_1d(np.array(given, np.float64)))
+        return self.sites.capacitance_f
 
     @cached_property
     def v_per_e(self) -> Floats:

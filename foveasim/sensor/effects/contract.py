@@ -48,6 +48,8 @@ __all__ = [
 T = TypeVar("T")
 #: Variance of values without noise.
 NOTHING = read_only(np.zeros(1))
+#: Default of the capacitance per area of a site: 2,809 e-/µm² at 3 V.
+CAPACITANCE_F_PER_UM2 = 1.5e-16
 #: Cached values of a sensor: several times those of all standard effects.
 MAX_CACHED = 64
 #: Sites on which the result of an effect at a site depends.
@@ -157,8 +159,8 @@ class Sites:
         Device with its fixed patterns. With None, moments are over all devices of the kind.
     exposure_s : float or None, s
         Exposure time, for collections that need it; None if it is unknown. Cached results do not depend on it.
-    capacitance_f : (n_site,) or (1,) float64, F
-        Capacitance of the sense nodes of all photosites.
+    given_f : (n_site,) or (1,) float64, F, or None
+        Capacitance of the sense nodes of all photosites; None for one in proportion to their areas.
     index : slice or (n,) int64
         Indices of these sites in the layout; an array for part of a sensor that is not a range of sites.
     n_threads : int or None
@@ -167,13 +169,15 @@ class Sites:
 
     layout: Photosites
     known_device: Device | None
-    capacitance_f: Floats
+    given_f: Floats | None
     index: slice | Ints = field(default_factory=lambda: slice(None))
     n_threads: int | None = None
     exposure_s: float | None = None
     #: All sites of the sensor that a part belongs to, and the indices of its sites among them, a slice of step 1 or (n,).
     _complete: tuple[Sites, slice | Ints] | None = field(default=None, repr=False)
     _cache: BoundedCache = field(default_factory=lambda: BoundedCache(MAX_CACHED), repr=False)
+    #: The default capacitances, which blocks of the sites share.
+    _by_area: dict[str, Floats] = field(default_factory=dict, repr=False)
 
     __repr__ = short_repr
 
@@ -183,6 +187,16 @@ class Sites:
         if isinstance(self.index, slice):
             return len(range(*self.index.indices(self.layout.n_sites)))
         return self.index.size
+
+    @property
+    def capacitance_f(self) -> Floats:
+        """Capacitance of the sense nodes of all photosites, (n_site,) or (1,) F."""
+        if self.given_f is not None:
+            return self.given_f
+        # At first use: tiles of large sensors do not use those of all sites.
+        if not self._by_area:
+            self._by_area["F"] = read_only(CAPACITANCE_F_PER_UM2 * self.layout.area_um2)
+        return self._by_area["F"]
 
     def block(self, index: slice | Ints, *, n_threads: int | None = 1) -> Sites:
         """Return some of the layout's sites."""
