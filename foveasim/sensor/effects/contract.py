@@ -176,8 +176,8 @@ class Sites:
     #: All sites of the sensor that a part belongs to, and the indices of its sites among them, a slice of step 1 or (n,).
     _complete: tuple[Sites, slice | Ints] | None = field(default=None, repr=False)
     _cache: BoundedCache = field(default_factory=lambda: BoundedCache(MAX_CACHED), repr=False)
-    #: The default capacitances, which blocks of the sites share.
-    _by_area: dict[str, Floats] = field(default_factory=dict, repr=False)
+    #: The default capacitances, once calculated: blocks of the sites share them.
+    _default_f: list[Floats] = field(default_factory=list, repr=False)
 
     __repr__ = short_repr
 
@@ -194,9 +194,9 @@ class Sites:
         if self.given_f is not None:
             return self.given_f
         # At first use: tiles of large sensors do not use those of all sites.
-        if not self._by_area:
-            self._by_area["F"] = read_only(CAPACITANCE_F_PER_UM2 * self.layout.area_um2)
-        return self._by_area["F"]
+        if not self._default_f:
+            self._default_f.append(read_only(CAPACITANCE_F_PER_UM2 * self.layout.area_um2))
+        return self._default_f[0]
 
     def block(self, index: slice | Ints, *, n_threads: int | None = 1) -> Sites:
         """Return some of the layout's sites."""
