@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from dense import dense_camera, dense_scene
+from dense import EXPOSURE_S, dense_camera, dense_scene
 from report import Report, best_s
 
 import foveasim as fs
@@ -55,7 +55,7 @@ def _bench_lattice(report: Report, n_side: int) -> None:
 
     def first(camera: fs.Camera) -> None:
         fresh = fs.Camera(optics=replace(camera.optics), sensor=replace(camera.sensor))
-        fresh.capture(scene, exposure_s=0.02, seed=0)
+        fresh.capture(scene, exposure_s=EXPOSURE_S, seed=0)
 
     lenses = fs.Camera(optics=plain.optics, sensor=replace(plain.sensor, pixel_optics=MICROLENS))
     times = best_s({"lenses": lambda: first(lenses), "plain": lambda: first(plain)}, N_REPEATS)

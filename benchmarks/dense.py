@@ -28,6 +28,8 @@ import foveasim as fs
 
 #: Pitch of the photosites and of the cells of the power map; the Airy disc has a diameter of 5.4 µm at f/4.
 PITCH_UM = 3.0
+#: At which no photosite is saturated, on sensors of these programs.
+EXPOSURE_S = 2e-4
 #: Distance of the scenes, and captures per figure; more of a cube in a file, whose time is that of memory.
 DISTANCE_M, N_REPEATS, N_CUBE_REPEATS = 1.0, 5, 15
 #: Bands of a hyperspectral scene.
@@ -75,7 +77,7 @@ def bench_first(report: Report, n_side: int) -> None:
         scene = dense_scene(n_side, n_bands)
 
         def first(scene: fs.Scene = scene, *, is_colour: bool = n_bands > 1) -> None:
-            dense_camera(n_side, is_colour=is_colour).capture(scene, exposure_s=0.02, seed=0)
+            dense_camera(n_side, is_colour=is_colour).capture(scene, exposure_s=EXPOSURE_S, seed=0)
 
         times = medians_s({"pair": pair_of(n_side), "first": first, "again": pair_of(n_side)}, N_REPEATS)
         report.slower_than(
@@ -94,7 +96,7 @@ import dense
 def status(key):
     return next(int(l.split()[1]) * 1024 for l in open("/proc/self/status") if l.startswith(key))
 def run(n_side, scene):
-    dense.dense_camera(n_side, is_colour=False).capture(scene, exposure_s=0.02, seed=0)
+    dense.dense_camera(n_side, is_colour=False).capture(scene, exposure_s=dense.EXPOSURE_S, seed=0)
 run(256, dense.dense_scene(256, 1))
 n_side = int(sys.argv[2])
 scene = dense.dense_scene(n_side, 1)
@@ -128,10 +130,10 @@ def bench_cube(report: Report, n_side: int) -> None:
 
         def from_file() -> None:
             cube = fs.Scene.from_cube(header, unit="W/(m^2 sr nm)", pitch_um=scene.pitch_um, distance_m=DISTANCE_M)
-            camera.capture(cube, exposure_s=0.02, seed=0)
+            camera.capture(cube, exposure_s=EXPOSURE_S, seed=0)
 
         times = medians_s(
-            {"file": from_file, "memory": lambda: camera.capture(scene, exposure_s=0.02, seed=0)},
+            {"file": from_file, "memory": lambda: camera.capture(scene, exposure_s=EXPOSURE_S, seed=0)},
             N_CUBE_REPEATS,
         )
     what = f"ENVI cube of {N_BANDS} bands, opened and captured"
@@ -147,7 +149,7 @@ n_side = int(sys.argv[2])
 scene, camera = dense.dense_scene(n_side, 1), dense.dense_camera(n_side, is_colour=False)
 with tempfile.TemporaryDirectory() as directory:
     start = time.perf_counter()
-    fs.tiles.write_tiles(Path(directory) / "capture.zarr", camera, scene, exposure_s=0.02, seed=0)
+    fs.tiles.write_tiles(Path(directory) / "capture.zarr", camera, scene, exposure_s=EXPOSURE_S, seed=0)
     duration_s = time.perf_counter() - start
 peak = next(int(l.split()[1]) * 1024 for l in open("/proc/self/status") if l.startswith("VmHWM"))
 print(duration_s, peak)
@@ -224,7 +226,7 @@ def _report_captures(report: Report, name: str, camera: fs.Camera, scene: fs.Sce
             del cells
 
     def capture() -> None:
-        camera.capture(scene, exposure_s=0.02, seed=0)
+        camera.capture(scene, exposure_s=EXPOSURE_S, seed=0)
 
     for _ in range(2):  # compiles the layout, and caches the factors of the lens, which it does from the second map on
         capture()

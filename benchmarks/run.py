@@ -28,7 +28,7 @@ import numpy as np
 import scipy.fft
 import shapely
 from angular import bench_angular
-from dense import bench_dense
+from dense import EXPOSURE_S, bench_dense
 from exploring import bench_exploring
 from field_modes import bench_field_modes
 from gradients import bench_gradients
@@ -164,8 +164,8 @@ def bench_optics(report: Report, shape: tuple[int, int]) -> None:
             "pair": pair,
             "optics": lambda: list(optics.weighted_maps(mono, np.ones((1, 1)))),
             "aberrated": lambda: list(aberrated.weighted_maps(mono, np.ones((1, 1)))),
-            "capture": lambda: camera.capture(mono, exposure_s=0.02, seed=0),
-            "first": lambda: fs.Camera(optics=optics, sensor=sensor).capture(mono, exposure_s=0.02, seed=0),
+            "capture": lambda: camera.capture(mono, exposure_s=EXPOSURE_S, seed=0),
+            "first": lambda: fs.Camera(optics=optics, sensor=sensor).capture(mono, exposure_s=EXPOSURE_S, seed=0),
         },
         6,
     )
@@ -187,8 +187,8 @@ def bench_wavelengths(report: Report, shape: tuple[int, int]) -> None:
     camera = fs.Camera(optics=optics, sensor=fs.Sensor(layout, filters="rgb"))
     times = best_s(
         {
-            "31": lambda: camera.capture(many, exposure_s=0.02, seed=0),
-            "3": lambda: camera.capture(few, exposure_s=0.02, seed=0),
+            "31": lambda: camera.capture(many, exposure_s=EXPOSURE_S, seed=0),
+            "3": lambda: camera.capture(few, exposure_s=EXPOSURE_S, seed=0),
         },
         4,
     )
@@ -230,8 +230,8 @@ def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
     )
     times = best_s(
         {
-            "bent": lambda: bent.capture(scene, exposure_s=0.02, seed=0),
-            "plain": lambda: plain.capture(scene, exposure_s=0.02, seed=0),
+            "bent": lambda: bent.capture(scene, exposure_s=EXPOSURE_S, seed=0),
+            "plain": lambda: plain.capture(scene, exposure_s=EXPOSURE_S, seed=0),
             "frame": lambda: carried(cells),
             "remap": lambda: straight(cv2.remap(cells, index, None, cv2.INTER_LINEAR)),
         },
@@ -397,12 +397,12 @@ def camera_for(scene):
     layout = run.paper_layout(optics.grid(scene))
     return fs.Camera(optics=optics, sensor=fs.Sensor(layout, qe=0.6, dark_e_per_s=20.0, read_noise_e=1.0))
 small = run.paper_scene((464, 825), np.ones((1, 1)), np.array([550.0]))
-camera_for(small).capture(small, exposure_s=0.02, seed=0)
+camera_for(small).capture(small, exposure_s=run.EXPOSURE_S, seed=0)
 scene = run.paper_scene(shape, np.ones((1, 1)), np.array([550.0]))
 camera = camera_for(scene)
 before = status("VmRSS")
 open("/proc/self/clear_refs", "w").write("5")
-camera.capture(scene, exposure_s=0.02, seed=0)
+camera.capture(scene, exposure_s=run.EXPOSURE_S, seed=0)
 print((status("VmHWM") - before) / (4 * shape[0] * shape[1]))
 """
 

@@ -746,6 +746,10 @@ def predict_codes(charges, tables, transfer, line, adc, mean_dn, variance_dn2):
             is_discrete = False
             low = mean - _range_below(variance + sigma * sigma) - half_step
             high = mean + _range_below(variance + sigma * sigma) + half_step
+        start, stop = _unquantised_code(low, site, adc), _unquantised_code(min(high, well + reach), site, adc)
+        if start == stop:  # saturated, or a charge without deviations
+            mean_dn[i], variance_dn2[i] = _quantise_with_dnl(start, _value_of_site(line, i), adc), 0.0
+            continue
         is_below_well = not is_discrete or high < well
         spread = math.sqrt(variance + sigma * sigma)
         if is_linear:
@@ -783,7 +787,6 @@ def predict_codes(charges, tables, transfer, line, adc, mean_dn, variance_dn2):
                 spread, n_terms = _edgeworth_coefficients(mean, mean, True, coefficients)
                 end = min(well, math.ceil(mean + _range_above(mean)))
         charge = (first, n, end, mean, spread, n_terms)
-        start, stop = _unquantised_code(low, site, adc), _unquantised_code(min(high, well + reach), site, adc)
         k_first, k_last = max(math.floor(start) - 1, 0), min(math.floor(stop) + 1, n_codes - 1)
         # Codes are relative to that of the mean: squares of large codes would lose digits of a small variance.
         reference = math.floor(_unquantised_code(min(mean, well), site, adc))
