@@ -149,7 +149,7 @@ n_side = int(sys.argv[2])
 scene, camera = dense.dense_scene(n_side, 1), dense.dense_camera(n_side, is_colour=False)
 with tempfile.TemporaryDirectory() as directory:
     start = time.perf_counter()
-    fs.tiles.write_tiles(Path(directory) / "capture.zarr", camera, scene, exposure_s=EXPOSURE_S, seed=0)
+    fs.tiles.write_tiles(Path(directory) / "capture.zarr", camera, scene, exposure_s=dense.EXPOSURE_S, seed=0)
     duration_s = time.perf_counter() - start
 peak = next(int(l.split()[1]) * 1024 for l in open("/proc/self/status") if l.startswith("VmHWM"))
 print(duration_s, peak)
