@@ -5,7 +5,7 @@ Each figure is the best of several runs, interleaved with those of its reference
 A benchmark in which a ratio misses its bound is run again, and the better ratio counts. A ratio that misses its bound again is
 marked; the program then exits with 1. Bounds hold on an idle machine: the last lines say how busy it was.
 
-    python benchmarks/run.py                  everything, about ten minutes
+    python benchmarks/run.py                  everything, about 15 minutes
     python benchmarks/run.py --quick          the same for a sixteenth of the pixels, without bounds
     python benchmarks/run.py sensor optics    some benchmarks
 """

@@ -12,6 +12,8 @@ from foveasim._core.validation import Floats, Ints, freeze
 
 __all__ = ["RectangleLattice"]
 
+#: Differences of sizes that are due to rounding, relative.
+ROUNDING = 1e-9
 #: Sites whose vertices are in memory at once, when a number per site is computed.
 SITES_PER_BLOCK = 2**16
 
@@ -45,6 +47,16 @@ class RectangleLattice:
     def n_sites(self) -> int:
         """Number of sites."""
         return self.y_um.shape[0] * self.x_um.shape[0]
+
+    @property
+    def site_size_um(self) -> tuple[float, float] | None:
+        """Width and height of the sites, µm; None if they are not equal, or without sites."""
+        if not self.n_sites:
+            return None
+        width_um, height_um = (axis[:, 1] - axis[:, 0] for axis in (self.x_um, self.y_um))
+        if any(np.ptp(sizes_um) > ROUNDING * sizes_um[0] for sizes_um in (width_um, height_um)):
+            return None
+        return float(width_um.mean()), float(height_um.mean())
 
     @property
     def bounds_um(self) -> tuple[float, float, float, float]:

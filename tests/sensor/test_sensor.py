@@ -271,6 +271,15 @@ def test_default_capacitance_follows_area():
     assert few.v_per_e.tolist() == sensor.v_per_e[1:].tolist()
 
 
+def test_sites_of_a_lattice_share_one_capacitance():
+    sensor = Sensor(grid(n_x=40, n_y=30, pitch_um=1.7, width_um=1.5))
+    part = sensor.part(np.arange(37, 250, 3))
+
+    assert part.node_f.tolist() == sensor.node_f.tolist() == pytest.approx([1.5e-16 * 1.5**2], rel=1e-9)
+    polygons = Sensor(Layout.from_polygons(sensor.layout.polygons()))
+    np.testing.assert_allclose(polygons.node_f, np.full(1200, 1.5e-16 * 1.5**2), rtol=1e-9)
+
+
 @pytest.mark.parametrize("bits", [4, 8, 12])
 def test_quantisation_error_variance_is_one_twelfth(bits):
     capacitance_f, n_codes = 1e-10, 2**bits

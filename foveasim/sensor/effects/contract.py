@@ -8,6 +8,7 @@ which follows from the moments by default.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
@@ -195,7 +196,11 @@ class Sites:
             return self.given_f
         # At first use: tiles of large sensors do not use those of all sites.
         if not self._default_f:
-            self._default_f.append(read_only(CAPACITANCE_F_PER_UM2 * self.layout.area_um2))
+            complete = self if self._complete is None else self._complete[0]
+            lattice = getattr(complete.layout, "lattice", None)
+            size_um = None if lattice is None else lattice.site_size_um
+            area_um2 = self.layout.area_um2 if size_um is None else np.full(1, math.prod(size_um))
+            self._default_f.append(read_only(CAPACITANCE_F_PER_UM2 * area_um2))
         return self._default_f[0]
 
     def block(self, index: slice | Ints, *, n_threads: int | None = 1) -> Sites:

@@ -166,12 +166,8 @@ def _in_blocks(
 def _one_of_lattice(sites: Photosites) -> Outlines | None:
     """Return the outline of one of the equal rectangles of a lattice; None for other layouts."""
     lattice = getattr(sites, "lattice", None)
-    if lattice is None or lattice.n_sites < 2:
+    if lattice is None or lattice.n_sites < 2 or lattice.site_size_um is None:
         return None
-    for low, high in (lattice.x_um.T, lattice.y_um.T):
-        width_um = high - low
-        if np.ptp(width_um) > CONGRUENT * width_um[0]:
-            return None
     return Outlines(*lattice.rings(0, 1))
 
 
