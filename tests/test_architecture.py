@@ -15,15 +15,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import foveasim
 from foveasim import Sensor
 from foveasim._core.validation import UNIT_SUFFIXES
-
-pytestmark = pytest.mark.slow
 
 PACKAGE = Path(foveasim.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
