@@ -70,6 +70,12 @@ class RectangleLattice:
         """Return the lattice with vertices ``factor * xy_um + shift_um``, for a positive factor."""
         return RectangleLattice(self.x_um * factor + shift_um[0], self.y_um * factor + shift_um[1])
 
+    def rows(self, first: int, last: int) -> RectangleLattice | None:
+        """Return the sites ``first`` to ``last - 1`` if they are complete rows, otherwise None."""
+        if not first < last or first % self.shape[1] or last % self.shape[1]:
+            return None
+        return RectangleLattice(self.x_um, self.y_um[first // self.shape[1] : last // self.shape[1]])
+
     def rings(self, first: int = 0, last: int | None = None) -> tuple[Floats, Ints, Ints]:
         """
         Return the packed rings of the sites ``first`` to ``last - 1``, by default of all.

@@ -470,7 +470,7 @@ class Layout:
         """Return the sites ``first`` to ``last - 1``."""
         last = max(first, last)
         if self.lattice is not None:
-            rings = self.lattice.rings(first, last)
+            rings = self.lattice.rows(first, last) or self.lattice.rings(first, last)
         else:
             site_offsets = self.site_offsets[first : last + 1]
             ring_offsets = self.ring_offsets[site_offsets[0] : site_offsets[-1] + 1]

@@ -43,11 +43,14 @@ def test_lattice_equals_stored_vertices(name):
         lambda layout: layout.scale(1.7, (0.3, 0.4)),
         lambda layout: layout.rotate(90.0),
         lambda layout: layout[[4, 1]],
+        lambda layout: layout[3:],
+        lambda layout: layout[2:5],
+        lambda layout: layout[3:3],
         lambda layout: layout.sort_by("row", descending=True),
         lambda layout: pickle.loads(pickle.dumps(layout)),
         lambda layout: layout.with_columns(channel=np.arange(6)),
     ],
-    ids=["translate", "scale", "rotate", "select", "sort", "pickle", "columns"],
+    ids=["translate", "scale", "rotate", "select", "row", "range", "none", "sort", "pickle", "columns"],
 )
 def test_changed_lattice_equals_changed_vertices(change):
     one, other = change(lattice_layout()), change(stored_layout())
@@ -67,6 +70,18 @@ def test_vertices_are_computed_when_read():
     assert has_vertices(layout)
     assert layout.xy_um is layout.xy_um
     assert not layout.xy_um.flags.writeable
+
+
+def test_complete_rows_remain_a_lattice():
+    layout = lattice_layout()
+
+    assert [layout[first:last].lattice is not None for first, last in ((0, 3), (3, 6), (0, 6), (1, 4), (0, 0))] == [
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_capture_of_grid_needs_no_vertices():
