@@ -57,7 +57,7 @@ from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
-#: Quantity that the optical axis is fixed to when the gaze moves: see :class:`Camera`.
+#: What the optical axis is fixed to when the gaze moves: see :class:`Camera`.
 GazeAxis = Literal["image", "sensor"]
 #: Exposures that exceed the time between them by this fraction do so by rounding.
 TIME_ROUNDING = 1e-9
@@ -191,7 +191,7 @@ class Camera:
 
     @property
     def axis(self) -> GazeAxis:
-        """Quantity that the optical axis is fixed to: ``"image"`` or ``"sensor"``."""
+        """Part that the optical axis moves with: ``"image"`` or ``"sensor"``."""
         return self._axis
 
     @property

@@ -962,7 +962,7 @@ class Optics(PointImages):
             )
 
     def _illumination(self, pixels: Grid, aperture: PSFModel, distance_m: float) -> list[FieldWeight] | None:
-        """Return the relative illumination of pixels: None for that of the emission, empty if 1."""
+        """Return relative illumination of pixels; None: the law of the emission; empty: uniform."""
         from foveasim.optics._field_modes import field_points_um, field_weights
 
         points_um = field_points_um(pixels, ILLUMINATION_POINTS)

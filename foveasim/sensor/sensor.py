@@ -387,7 +387,7 @@ class Sensor:
 
     @cached_property
     def arrays(self) -> Mapping[str, NDArray[Any]]:
-        """Arrays of which settings contain the checksum, by SHA-256."""
+        """Arrays that settings store only as a checksum, by SHA-256."""
         parts = [getattr(self, each.name) for each in fields(Sensor) if each.name not in (*SPECTRAL, "layout")]
         return MappingProxyType(large_arrays(parts))
 
@@ -1359,9 +1359,11 @@ def _object(classes: Mapping[str, Any], name: str, data: Any, arrays: Mapping[st
         return values  # a parameter of an effect
     kind = str(data["kind"])
     if kind not in classes:
-        raise ParameterError("sensor", f"must be given: its effect {kind!r} is not registered")
+        raise ParameterError("sensor", f"cannot be restored: effect {kind!r} is not registered; pass sensor=")
     parameters = {each.name: each.init for each in fields(classes[kind])}
     unknown = next((key for key in values if key not in parameters), None)
     if unknown is not None:
-        raise ParameterError("sensor", f"must be given: its effect {kind!r} has no parameter {unknown!r} any more")
+        raise ParameterError(
+            "sensor", f"cannot be restored: effect {kind!r} has no parameter {unknown!r} any more; pass sensor="
+        )
     return classes[kind](**{key: value for key, value in values.items() if parameters[key]})

@@ -396,7 +396,9 @@ def test_settings_describe_registered_effects():
 
     assert again.chain[-1] == Registered(2.5)
     assert again.coupling == sensor.coupling
-    with pytest.raises(ParameterError, match="'sensor' must be given: its effect 'LampFlicker' is not registered"):
+    with pytest.raises(
+        ParameterError, match="'sensor' cannot be restored: effect 'LampFlicker' is not registered; pass sensor="
+    ):
         Sensor.from_settings(layout, to_plain_data(Sensor(layout, effects=[LampFlicker()])))
 
 
@@ -460,7 +462,9 @@ def test_capture_of_unregistered_effect_has_sensor(tmp_path):
     capture.save(tmp_path / "capture.npz")
 
     assert np.array_equal(capture.signal_to_noise(), capture.signal_to_noise(sensor=sensor))
-    with pytest.raises(ParameterError, match="'sensor' must be given: its effect 'LampFlicker' is not registered"):
+    with pytest.raises(
+        ParameterError, match="'sensor' cannot be restored: effect 'LampFlicker' is not registered; pass sensor="
+    ):
         fs.Capture.load(tmp_path / "capture.npz").signal_to_noise()
 
 
@@ -470,7 +474,7 @@ def test_settings_of_changed_effects_are_rejected():
     settings = to_plain_data(Sensor(ROW[:10], **FINE, effects=[Registered(2.5)]))
     settings["effects"][0]["former_e"] = 1.0
 
-    with pytest.raises(ParameterError, match="its effect 'Registered' has no parameter 'former_e' any more"):
+    with pytest.raises(ParameterError, match="effect 'Registered' has no parameter 'former_e' any more"):
         Sensor.from_settings(ROW[:10], settings)
 
 
