@@ -28,7 +28,7 @@ import foveasim as fs
 
 #: Pitch of the photosites and of the cells of the power map; the Airy disc has a diameter of 5.4 µm at f/4.
 PITCH_UM = 3.0
-#: At which no photosite is saturated, on sensors of these programs.
+#: Exposure below the saturation of all sensors of these programs.
 EXPOSURE_S = 2e-4
 #: Distance of the scenes, and captures per figure; more of a cube in a file, whose time is that of memory.
 DISTANCE_M, N_REPEATS, N_CUBE_REPEATS = 1.0, 5, 15

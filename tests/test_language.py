@@ -156,7 +156,6 @@ def has_phrase(path: str) -> bool:
     return any(re.search(phrase.lower(), words) for phrase in PHRASES.values())
 
 
-@pytest.mark.slow
 def test_prose_uses_standard_terms():
     found = [line for path in FILES if has_phrase(path) for line in phrases_found(texts(path))]
     assert not found, f"{len(found)} phrases\n" + "\n".join(found)
@@ -181,7 +180,6 @@ def test_planted_phrases_are_found(path, source, phrase):
     assert [line.split("'")[1] for line in phrases_found(found)] == [phrase]
 
 
-@pytest.mark.slow
 def test_docstring_summaries_are_short_phrases():
     found = [line for path in PACKAGE for line in bad_summaries(path)]
     assert not found, f"{len(found)} summaries\n" + "\n".join(found)

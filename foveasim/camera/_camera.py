@@ -191,7 +191,7 @@ class Camera:
 
     @property
     def axis(self) -> GazeAxis:
-        """Part that the optical axis moves with: ``"image"`` or ``"sensor"``."""
+        """Reference of the optical axis when the gaze moves: ``"image"`` or ``"sensor"``."""
         return self._axis
 
     @property

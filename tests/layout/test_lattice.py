@@ -75,13 +75,8 @@ def test_vertices_are_computed_when_read():
 def test_complete_rows_remain_a_lattice():
     layout = lattice_layout()
 
-    assert [layout[first:last].lattice is not None for first, last in ((0, 3), (3, 6), (0, 6), (1, 4), (0, 0))] == [
-        True,
-        True,
-        True,
-        False,
-        False,
-    ]
+    assert all(layout[rows].lattice is not None for rows in (slice(3), slice(3, 6), slice(None)))
+    assert all(layout[others].lattice is None for others in (slice(1, 4), slice(0), [0, 1, 2]))
 
 
 def test_capture_of_grid_needs_no_vertices():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -274,8 +275,11 @@ def test_default_capacitance_follows_area():
 def test_sites_of_a_lattice_share_one_capacitance():
     sensor = Sensor(grid(n_x=40, n_y=30, pitch_um=1.7, width_um=1.5))
     part = sensor.part(np.arange(37, 250, 3))
+    again = pickle.loads(pickle.dumps(part.part(slice(5, 20))))
 
-    assert part.node_f.tolist() == sensor.node_f.tolist() == pytest.approx([1.5e-16 * 1.5**2], rel=1e-9)
+    node_f = sensor.node_f.tolist()
+    assert node_f == pytest.approx([1.5e-16 * 1.5**2], rel=1e-9)
+    assert part.node_f.tolist() == again.node_f.tolist() == node_f
     polygons = Sensor(Layout.from_polygons(sensor.layout.polygons()))
     np.testing.assert_allclose(polygons.node_f, np.full(1200, 1.5e-16 * 1.5**2), rtol=1e-9)
 
@@ -296,6 +300,22 @@ def test_every_code_occurs_at_its_centre(bits):
     charge_e = charge_for((np.arange(n_codes) + 0.5) * 3.0 / n_codes, capacitance_f)
     code = codes(charge_e, bits=bits, capacitance_f=capacitance_f)
     np.testing.assert_array_equal(code, np.arange(n_codes))
+
+
+@pytest.mark.parametrize("read_noise_e", [0.0, 3.0])
+@pytest.mark.parametrize(
+    "adc",
+    [{}, {"companding": "root"}, {"companding": "log"}, {"nonlinearity_fraction": 0.05}, {"inl_dn": (0.0, 1.5, -40.0)}],
+    ids=["linear", "root", "log", "nonlinear", "inl"],
+)
+def test_prediction_of_saturated_sites_is_certain(adc, read_noise_e):
+    sensor = Sensor(MANY[:100], bits=10, capacitance_f=1e-15, read_noise_e=read_noise_e, **adc)
+    mean_dn, variance_dn2 = sensor.predict(np.full(100, 60_000.0), exposure_s=1.0)  # full scale: 18,725 e-
+
+    read_dn = sensor.read(np.full(100, 60_000), seed=1)
+    assert mean_dn.tolist() == read_dn.tolist()
+    assert read_dn.max() == (984 if "inl_dn" in adc else 1023)
+    assert not variance_dn2.any()
 
 
 @pytest.mark.parametrize("bits", range(1, 17))

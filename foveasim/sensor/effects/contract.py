@@ -177,8 +177,6 @@ class Sites:
     #: All sites of the sensor that a part belongs to, and the indices of its sites among them, a slice of step 1 or (n,).
     _complete: tuple[Sites, slice | Ints] | None = field(default=None, repr=False)
     _cache: BoundedCache = field(default_factory=lambda: BoundedCache(MAX_CACHED), repr=False)
-    #: The default capacitances, once calculated: blocks of the sites share them.
-    _default_f: list[Floats] = field(default_factory=list, repr=False)
 
     __repr__ = short_repr
 
@@ -195,13 +193,17 @@ class Sites:
         if self.given_f is not None:
             return self.given_f
         # At first use: tiles of large sensors do not use those of all sites.
-        if not self._default_f:
-            complete = self if self._complete is None else self._complete[0]
-            lattice = getattr(complete.layout, "lattice", None)
-            size_um = None if lattice is None else lattice.site_size_um
-            area_um2 = self.layout.area_um2 if size_um is None else np.full(1, math.prod(size_um))
-            self._default_f.append(read_only(CAPACITANCE_F_PER_UM2 * area_um2))
-        return self._default_f[0]
+        return self._cache.get("capacitance_f", self._default_f)
+
+    def _default_f(self) -> Floats:
+        """Return capacitances by area: one for the equal sites of a lattice, and of its parts."""
+        complete = self
+        while complete._complete is not None:
+            complete = complete._complete[0]
+        lattice = getattr(complete.layout, "lattice", None)
+        size_um = None if lattice is None else lattice.site_size_um
+        area_um2 = self.layout.area_um2 if size_um is None else np.full(1, math.prod(size_um))
+        return read_only(CAPACITANCE_F_PER_UM2 * area_um2)
 
     def block(self, index: slice | Ints, *, n_threads: int | None = 1) -> Sites:
         """Return some of the layout's sites."""
