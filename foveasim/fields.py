@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import publish
-from foveasim._core.rings import select_sites
+from foveasim._core.rings import check_packed, select_sites
 from foveasim._core.short_repr import short_repr
 from foveasim._core.show import Drawn, drawn
 from foveasim._core.validation import (
@@ -101,9 +101,9 @@ class Outlines:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        for name, dtype in (("xy_um", np.float64), ("ring_offsets", np.int64), ("site_offsets", np.int64)):
-            array = np.ascontiguousarray(getattr(self, name), dtype)
-            object.__setattr__(self, name, own(array.reshape(-1, 2) if name == "xy_um" else array))
+        rings = check_packed(self.xy_um, self.ring_offsets, self.site_offsets, min_vertices=0, min_rings=0)
+        for name, array in zip(("xy_um", "ring_offsets", "site_offsets"), rings, strict=True):
+            object.__setattr__(self, name, own(array))
 
     @property
     def n_sites(self) -> int:

@@ -28,7 +28,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.validation import Floats, Ints, read_only
+from foveasim._core.validation import Floats, Ints, as_numbers, read_only, unmasked
 from foveasim.errors import ParameterError
 
 #: Distances of sites that differ by less than this fraction are equal: rounding of coordinates of a few millimetres.
@@ -40,6 +40,34 @@ MIN_TURN_RAD = 1e-12
 MITRE_LIMIT = 100.0
 #: Moments of this number of vertices are computed by a kernel: the import of numba takes longer than those of fewer.
 KERNEL_VERTICES = 1 << 14
+
+
+def _check_offsets(name: str, offsets: ArrayLike, at_least: int, total: int, item_name: str) -> Ints:
+    """Return offsets as int64 after checks of their range and smallest step."""
+    array = np.asarray(unmasked(name, offsets))
+    if array.ndim != 1 or array.size < 1 or array.dtype.kind not in "iu":
+        raise ParameterError(name, "must be a list of integers", offsets)
+    array = np.ascontiguousarray(array, np.int64)
+    if array[0] != 0 or array[-1] != total:
+        raise ParameterError(name, f"must begin at 0 and end at {total}, the number of {item_name}", array)
+    small = np.flatnonzero(np.diff(array) < at_least)
+    if small.size:
+        raise ParameterError(
+            name, f"must assign at least {at_least} {item_name} to each item, but item {small[0]} has fewer", array
+        )
+    return array
+
+
+def check_packed(
+    xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: ArrayLike, *, min_vertices: int = 1, min_rings: int = 1
+) -> tuple[Floats, Ints, Ints]:
+    """Return packed rings as contiguous arrays after checks of shapes and sizes."""
+    xy = as_numbers("xy_um", xy_um)
+    if xy.ndim != 2 or xy.shape[1] != 2:
+        raise ParameterError("xy_um", f"must have the shape (n_vertex, 2), got {xy.shape}")
+    rings = _check_offsets("ring_offsets", ring_offsets, min_vertices, xy.shape[0], "vertices")
+    sites = _check_offsets("site_offsets", site_offsets, min_rings, rings.size - 1, "rings")
+    return np.ascontiguousarray(xy), rings, sites
 
 
 def next_vertex(ring_offsets: Ints) -> Ints:

@@ -337,6 +337,8 @@ def finite_array(
 
 def check_broadcast(**arrays: NDArray[Any]) -> tuple[int, ...]:
     """Return the common shape of arrays, by the names of their parameters."""
+    with suppress(ValueError):
+        return np.broadcast_shapes(*(array.shape for array in arrays.values()))
     names = list(arrays)
     for n in range(2, len(names) + 1):
         try:
@@ -346,7 +348,14 @@ def check_broadcast(**arrays: NDArray[Any]) -> tuple[int, ...]:
             raise ParameterError(
                 names[n - 1], f"must have a shape that broadcasts with {others}, got {arrays[names[n - 1]].shape}"
             ) from None
-    return np.broadcast_shapes(*(array.shape for array in arrays.values()))
+    raise AssertionError("unreachable")
+
+
+def as_broadcast(**arrays: ArrayLike) -> list[NDArray[Any]]:
+    """Return arrays of numbers whose shapes broadcast, by the names of their parameters."""
+    numbers = {name: as_numbers(name, value) for name, value in arrays.items()}
+    check_broadcast(**numbers)
+    return list(numbers.values())
 
 
 def exact_integers(values: Sequence[int]) -> NDArray[Any] | None:

@@ -389,7 +389,7 @@ class Camera:
         grid: Grid,
         *,
         order: Literal[1, 2] = 1,
-        n_grids: int = 1,
+        n_grids: Annotated[int, Limits(at_least=1)] = 1,
         position_um: Position | None = None,
         compiled: bool = True,
         footprints: Footprints | None = None,
@@ -417,7 +417,7 @@ class Camera:
         Integrator
             From the cache, when the same one was used recently.
         """
-        position_um = self.position_um if position_um is None else position_um
+        position_um = self.position_um if position_um is None else check_point("position_um", position_um)
         key = (
             grid,
             order,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from foveasim._core.calls import NOT_NEGATIVE, POSITIVE, Limits
 from foveasim._core.extras import import_optional
 from foveasim._core.provenance import to_plain_data, versions
-from foveasim._core.validation import Floats, check_choice, check_number, finite_array, read_only
+from foveasim._core.validation import Floats, check_choice, check_number, check_point, read_only
 from foveasim.camera import Camera
 from foveasim.camera._framing import different_part
 from foveasim.compare.annuli import Annuli, quality_by_eccentricity
@@ -359,7 +359,7 @@ def cameras(
     {'grid': 6400, 'hexagonal': 6405}
     """
     named = _check_cameras(cameras)
-    fixation: tuple[float, float] = tuple(finite_array("centre_um", centre_um).tolist())
+    fixation = check_point("centre_um", centre_um)
     budgets = {name: budget_of(camera, _rate(frames_per_s, name, exposure_s)) for name, camera in named.items()}
     check_equal_budgets(budgets, budget, tolerance)
     first = next(iter(named.values()))  # its lens is that of all cameras

@@ -16,12 +16,13 @@ from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
+from foveasim._core.validation import check_choice
 from foveasim._io.images import read_picture
 from foveasim._io.yaml_files import parse_yaml, read_yaml
 from foveasim.camera import Camera
 from foveasim.camera._exposure import exposure_time
 from foveasim.capture import Capture
-from foveasim.config._models import FILE_OPTIONS, LayerSection, PerArea, call_of, models
+from foveasim.config._models import FILE_OPTIONS, LayerSection, Models, PerArea, call_of, models
 from foveasim.config._problems import adapter_of, plain_settings, validate
 from foveasim.config._requirements import Requirement
 from foveasim.config._sources import Source
@@ -465,7 +466,7 @@ def schema(section: Any = "shot", title: str = "foveasim settings") -> dict[str,
     >>> list(fs.config.schema()["properties"])[:6]
     ['scene', 'optics', 'distortion', 'layout', 'sensor', 'exposure_s']
     """
-    model = getattr(models(), section) if isinstance(section, str) else section
+    model = getattr(models(), check_choice("section", section, Models._fields)) if isinstance(section, str) else section
     model_schema = adapter_of("section", model).json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model_schema, "title": title}
 

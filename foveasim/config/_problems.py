@@ -74,7 +74,7 @@ def adapter_of(name: str, kind: Any) -> TypeAdapter[Any]:
     try:
         if not isinstance(kind, str):  # the name of a type, for pydantic
             return TypeAdapter(kind)
-    except PydanticUserError:
+    except (PydanticUserError, KeyError, TypeError):
         pass
     raise ParameterError(name, "must be a model of settings", kind)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from foveasim._io.yaml_files import position_of
-from foveasim.errors import ConfigError
+from foveasim.errors import ConfigError, ParameterError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,8 +64,11 @@ class Source:
 
     def error(self, key_path: str | tuple[str, ...], problem: str) -> ConfigError:
         """Return an error about a setting, such as ``"sensor.bits"``, with its position."""
-        parts = key_path if isinstance(key_path, tuple) else tuple(re.findall(r"[^.\[\]]+", key_path))
-        name = ".".join(key_path) if isinstance(key_path, tuple) else key_path
+        is_path = isinstance(key_path, tuple) and all(isinstance(key, str) for key in key_path)
+        if not is_path and not isinstance(key_path, str):
+            raise ParameterError("key_path", "must be a text such as 'sensor.bits', or a tuple of keys", key_path)
+        parts = tuple(key_path) if is_path else tuple(re.findall(r"[^.\[\]]+", str(key_path)))
+        name = ".".join(parts) if is_path else str(key_path)
         for n in range(len(parts), 0, -1):
             origin = self.replaced.get(".".join(parts[:n]))
             if isinstance(origin, str):

@@ -16,6 +16,7 @@ from foveasim._core.calls import FINITE, POSITIVE, OwnCheck
 from foveasim._core.names import CHANNEL_LETTERS, possible_names
 from foveasim._core.provenance import copy_plain_data
 from foveasim._core.rings import (
+    check_packed,
     convexity,
     from_frame,
     polygons_of,
@@ -34,8 +35,8 @@ from foveasim._core.validation import (
     Bools,
     Floats,
     Ints,
-    as_numbers,
     check_per_site,
+    check_point,
     exact_integers,
     finite_array,
     freeze,
@@ -157,22 +158,16 @@ class Layout:
 
     def _store(self) -> None:
         """Check the structure of the fields, and store read-only arrays."""
-        xy_um = as_numbers("xy_um", self.xy_um)
-        if xy_um.ndim != 2:
-            raise ParameterError("xy_um", f"must have 2 dimensions, got the shape {xy_um.shape}")
-        if xy_um.shape[1] != 2:
-            raise ParameterError("xy_um", f"must have the shape (n_vertex, 2), got {xy_um.shape}")
-        ring_offsets = _offsets("ring_offsets", self.ring_offsets, 3, xy_um.shape[0], "vertices")
-        site_offsets = _offsets("site_offsets", self.site_offsets, 1, ring_offsets.size - 1, "rings")
+        rings = check_packed(self.xy_um, self.ring_offsets, self.site_offsets, min_vertices=3)
+        xy_um = rings[0]
         if xy_um.size:
             # Minimum and maximum propagate NaN, and need no array as large as the vertices.
             largest_um = max(-float(xy_um.min()), float(xy_um.max()))
             if not np.isfinite(largest_um):
                 finite_array("xy_um", xy_um)  # raises an error with the position
             _require_near_origin(largest_um)
-        object.__setattr__(self, "xy_um", own(np.ascontiguousarray(xy_um)))
-        object.__setattr__(self, "ring_offsets", own(ring_offsets))
-        object.__setattr__(self, "site_offsets", own(site_offsets))
+        for name, array in zip(RINGS, rings, strict=True):
+            object.__setattr__(self, name, own(array))
         self._store_columns()
 
     def _store_columns(self) -> None:
@@ -314,7 +309,7 @@ class Layout:
         2
         """
         if _is_packed(polygons):
-            xy_um, ring_offsets, site_offsets = _check_packed(*polygons)
+            xy_um, ring_offsets, site_offsets = check_packed(*polygons)
         else:
             xy_um, ring_offsets, site_offsets = _pack_polygons(polygons)
         _require(_per_site(~np.isfinite(xy_um), ring_offsets, site_offsets), "has a coordinate that is not finite")
@@ -547,14 +542,14 @@ class Layout:
         quarters, rest = divmod(angle_deg, 90.0)
         exact = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
         c, s = exact if rest == 0.0 else (np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg)))
-        centre = finite_array("origin_um", origin_um)
+        centre = np.array(check_point("origin_um", origin_um))
         # (A @ xy) row by row: x' = c x - s y, y' = s x + c y
         rotated = (self.xy_um - centre) @ np.array([[c, s], [-s, c]]) + centre
         return derived(self, f"rotated by {angle_deg:g} degrees", (rotated, self.ring_offsets, self.site_offsets))
 
     def scale(self, factor: Annotated[float, POSITIVE], origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
         """Scale the layout about a point."""
-        centre = finite_array("origin_um", origin_um)
+        centre = np.array(check_point("origin_um", origin_um))
         step = f"scaled by {factor:g}"
         if self.lattice is not None:
             return derived(self, step, self.lattice.scaled(1.0, -centre).scaled(factor, centre))
@@ -658,22 +653,6 @@ def winding_um2(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats
 # -- validation of input polygons --------------------------------------------------------------------------------
 
 
-def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, item_name: str) -> Ints:
-    """Return offsets as int64 after checks of their range and smallest step."""
-    array = np.asarray(unmasked(name, offsets))
-    if array.ndim != 1 or array.size < 1 or array.dtype.kind not in "iu":
-        raise ParameterError(name, "must be a list of integers", offsets)
-    array = np.ascontiguousarray(array, np.int64)
-    if array[0] != 0 or array[-1] != total:
-        raise ParameterError(name, f"must begin at 0 and end at {total}, the number of {item_name}", array)
-    small = np.flatnonzero(np.diff(array) < at_least)
-    if small.size:
-        raise ParameterError(
-            name, f"must assign at least {at_least} {item_name} to each item, but item {small[0]} has fewer", array
-        )
-    return array
-
-
 def _column(name: str, values: ArrayLike) -> NDArray[Any]:
     """Convert a data column to a read-only array of numbers or strings."""
     values = unmasked(name, values)
@@ -705,14 +684,6 @@ def _require_indices(name: str, column: NDArray[Any]) -> None:
         worst = int(column.min()) if column.min() < 0 else int(column.max())
         if not 0 <= worst <= MAX_SITES:
             raise ParameterError(name, f"must contain integers from 0 to {MAX_SITES}", worst)
-
-
-def _check_packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: ArrayLike) -> tuple[Floats, Ints, Ints]:
-    xy = as_numbers("xy_um", xy_um)
-    if xy.ndim != 2 or xy.shape[1] != 2:
-        raise ParameterError("xy_um", f"must have the shape (n_vertex, 2), got {xy.shape}")
-    rings = _offsets("ring_offsets", ring_offsets, 1, xy.shape[0], "vertices")
-    return xy, rings, _offsets("site_offsets", site_offsets, 1, rings.size - 1, "rings")
 
 
 def _is_packed(polygons: Any) -> bool:

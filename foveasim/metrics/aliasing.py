@@ -20,6 +20,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Floats,
     check_length_um,
+    check_point,
     finite_array,
     read_only,
 )
@@ -342,7 +343,7 @@ def _region(layout: Layout, centre_um: tuple[float, float] | None, radius_um: fl
     x_min, y_min, x_max, y_max = layout.bounds_um
     centre = np.array([0.5 * (x_min + x_max), 0.5 * (y_min + y_max)])
     if centre_um is not None:
-        centre = finite_array("centre_um", centre_um)
+        centre = np.array(check_point("centre_um", centre_um))
     radius_um = 0.5 * min(x_max - x_min, y_max - y_min) if radius_um is None else radius_um
     radius_um = check_length_um("radius_um", radius_um)
     xy_um = layout.centroid_um - centre

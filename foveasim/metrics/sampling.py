@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.calls import Limits
 from foveasim._core.rings import TIE_FRACTION
-from foveasim._core.validation import Bools, Floats, Ints, finite_array, read_only
+from foveasim._core.validation import Bools, Floats, Ints, check_point, read_only
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.units import per_mm_from_per_um
@@ -288,7 +288,7 @@ def nyquist_vs_eccentricity(
     >>> list(table.records()[0])
     ['from_um', 'to_um', 'n_sites', 'size_um', 'nyquist_min_per_mm', 'nyquist_per_mm', 'nyquist_max_per_mm']
     """
-    centre = finite_array("centre_um", centre_um)
+    centre = check_point("centre_um", centre_um)
     if layout.n_sites == 0:
         raise ParameterError("layout", "must have at least one site")
     nyquist = nyquist_per_mm(layout, by=by, per_channel=per_channel)

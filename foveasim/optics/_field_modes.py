@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import parallel_map
-from foveasim._core.validation import Floats
+from foveasim._core.validation import Floats, as_numbers, own
 from foveasim.fields import Grid
 from foveasim.optics._aperture import PSFModel, overlaps
 
@@ -98,8 +98,8 @@ class FieldModes:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        for values in (self.points_um, self.combinations, self.at_points, self.singular_values):
-            values.setflags(write=False)  # the cache of the lens has them
+        for name in ("points_um", "combinations", "at_points", "singular_values"):
+            object.__setattr__(self, name, own(as_numbers(name, getattr(self, name))))  # the cache of the lens has them
 
     @property
     def n_modes(self) -> int:

@@ -21,10 +21,10 @@ from foveasim._core.calls import Declared, Limits, check_declared
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import (
     Floats,
-    as_numbers,
-    check_broadcast,
+    as_broadcast,
     check_count,
     check_number,
+    check_point,
     finite_array,
     wavelengths_nm,
 )
@@ -118,8 +118,7 @@ def zernike(n: int, m: int, x: ArrayLike, y: ArrayLike) -> Floats:
     check_count("n", n, at_least=0, at_most=MAX_ORDER)
     if n < abs(m) or (n - m) % 2:
         raise ParameterError("m", f"must be from -n to n = {n} in steps of two", m)
-    x, y = as_numbers("x", x), as_numbers("y", y)
-    check_broadcast(x=x, y=y)
+    x, y = as_broadcast(x=x, y=y)
     r2 = x * x + y * y
     k = (n - abs(m)) // 2
     radial = (-1) ** k * eval_jacobi(k, abs(m), 0, 1.0 - 2.0 * r2)
@@ -218,7 +217,8 @@ class Zernike:
 
     def wavefront_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:  # noqa: ARG002
         """Return the path difference in µm at points of the aperture."""
-        total_um = np.zeros(np.broadcast(x, y).shape)
+        x, y = as_broadcast(x=x, y=y)
+        total_um = np.zeros(np.broadcast_shapes(x.shape, y.shape))
         for (n, m), number_um in self.coefficients_um(wavelength_nm).items():
             if number_um:
                 total_um += number_um * zernike(n, m, x, y)
@@ -270,7 +270,8 @@ class Seidel(Declared):
 
     def wavefront_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:  # noqa: ARG002
         """Return the path difference in µm at points of the aperture, for an image point."""
-        hx, hy = (c / self.field_radius_um for c in field_um)
+        x, y = as_broadcast(x=x, y=y)
+        hx, hy = (c / self.field_radius_um for c in check_point("field_um", field_um))
         r2 = x * x + y * y
         along = x * hx + y * hy  # h r cos u
         return np.asarray(

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import FINITE, FRACTION, Declared, Limits
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Bools, Floats, as_numbers, finite_array, read_only
+from foveasim._core.validation import Bools, Floats, as_broadcast, as_numbers, finite_array, read_only
 from foveasim._io.images import read_picture, write_picture
 from foveasim.errors import ParameterError
 from foveasim.fields import from_file_rows
@@ -63,6 +63,7 @@ class Annulus(Declared):
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002 -- signature of all pupils
         """Return the amplitudes at points of the aperture."""
+        x, y = as_broadcast(x=x, y=y)
         return np.asarray(x * x + y * y >= self.obscuration**2)
 
     def edges(self) -> PupilEdges:
@@ -97,7 +98,8 @@ class Spider(Declared):
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
         """Return the amplitudes at points of the aperture."""
-        is_open = np.ones(np.broadcast(x, y).shape, bool)
+        x, y = as_broadcast(x=x, y=y)
+        is_open = np.ones(np.broadcast_shapes(x.shape, y.shape), bool)
         for angle in np.radians(self.angle_deg + 360.0 / self.n_vanes * np.arange(self.n_vanes)):
             along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
             is_open &= (along < 0.0) | (np.abs(across) > self.width_fraction)
@@ -136,7 +138,8 @@ class Blades(Declared):
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
         """Return the amplitudes at points of the aperture."""
-        is_open = np.ones(np.broadcast(x, y).shape, bool)
+        x, y = as_broadcast(x=x, y=y)
+        is_open = np.ones(np.broadcast_shapes(x.shape, y.shape), bool)
         inner = np.cos(np.pi / self.n_blades)
         for angle in np.radians(self.angle_deg + 360.0 / self.n_blades * (np.arange(self.n_blades) + 0.5)):
             is_open &= x * np.cos(angle) + y * np.sin(angle) <= inner
@@ -175,6 +178,7 @@ class Slit(Declared):
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
         """Return the amplitudes at points of the aperture."""
+        x, y = as_broadcast(x=x, y=y)
         angle = np.radians(self.angle_deg)
         return np.asarray(np.abs(y * np.cos(angle) - x * np.sin(angle)) <= self.width_fraction)
 
@@ -257,6 +261,7 @@ class PupilImage:
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> NDArray[Any]:
         """Return the amplitudes at points of the aperture."""
+        x, y = as_broadcast(x=x, y=y)
         amplitude = as_numbers("picture", self.picture)  # type: ignore[arg-type]
         n = amplitude.shape[0]
         row, column = (

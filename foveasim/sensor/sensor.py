@@ -20,7 +20,9 @@ from foveasim._core.validation import (
     Bools,
     Floats,
     Ints,
+    as_broadcast,
     as_numbers,
+    check_broadcast,
     check_per_site,
     finite_array,
     read_only,
@@ -783,7 +785,10 @@ class Sensor:
 
     def are_saturated(self, electrons: Ints, code: NDArray[Any]) -> Bools:
         """Return which sites have a full well or the highest code, (n_site,)."""
-        return np.asarray((code == 2**self.bits - 1) | (electrons >= self.well_e))
+        charges = as_numbers("electrons", electrons, keep_type=True)
+        codes = as_numbers("code", code, keep_type=True)
+        check_broadcast(well_e=self.well_e, electrons=charges, code=codes)
+        return np.asarray((codes == 2**self.bits - 1) | (charges >= self.well_e))
 
     # -- charges and codes ----------------------------------------------------------------------------------------
 
@@ -1052,7 +1057,8 @@ class Sensor:
             For shot noise, the charge plus one: the posterior mean of the expected charge, plus ``noise_e2``. For another
             collection, its variance plus one plus ``noise_e2``, over the square of its slope.
         """
-        return invert_collection(self.collection, self._sites_during(exposure_s), charge_e, noise_e2)
+        charges, noise = as_broadcast(charge_e=charge_e, noise_e2=noise_e2)
+        return invert_collection(self.collection, self._sites_during(exposure_s), charges, noise)
 
     def readout_model(
         self,

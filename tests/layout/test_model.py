@@ -489,7 +489,7 @@ def test_indices_must_be_integers_from_zero(name, values):
     ("changes", "message"),
     [
         pytest.param({"xy_um": np.zeros((4, 3))}, r"'xy_um' must have the shape \(n_vertex, 2\)", id="three columns"),
-        pytest.param({"xy_um": np.zeros(8)}, "'xy_um' must have 2 dimensions", id="flat"),
+        pytest.param({"xy_um": np.zeros(8)}, r"'xy_um' must have the shape \(n_vertex, 2\)", id="flat"),
         pytest.param(
             {"xy_um": [[0, 0], [1, np.nan], [1, 1], [0, 1]]}, r"'xy_um' must be finite.* at \[1, 1\]", id="nan"
         ),

@@ -252,13 +252,13 @@ def _class(name: str, accepts: Callable[[Any], bool]) -> Kind:
 def _fixed_sequence(items: tuple[Any, ...]) -> Kind | None:
     """Return the kind of a sequence of a fixed length; functions check its numbers."""
     kinds = [kind_of(item) for item in items]
-    tests = [None if kind in (None, _NUMBER, _INTEGER) else kind.accepts for kind in kinds if kind]
+    tests = [_is_no_sequence if kind in (_NUMBER, _INTEGER) else kind.accepts for kind in kinds if kind]
     n = len(items)
 
     def accepts(value: Any) -> bool:
         if not _is_sequence(value) or len(value) != n:
             return False
-        return len(tests) != n or all(test is None or test(item) for test, item in zip(tests, value, strict=True))
+        return len(tests) != n or all(test(item) for test, item in zip(tests, value, strict=True))
 
     names = {kind.many if kind else "values" for kind in kinds}
     one = f"{COUNTS.get(n, n)} {names.pop() if len(names) == 1 else 'values'}"
@@ -364,6 +364,11 @@ def _is_sequence(value: Any) -> bool:
     return isinstance(value, abc.Sequence | abc.KeysView | abc.ValuesView) or (
         hasattr(value, "__len__") and hasattr(value, "__getitem__")
     )
+
+
+def _is_no_sequence(value: Any) -> bool:
+    kind = type(value)
+    return kind is float or kind is int or not _is_sequence(value)
 
 
 def _is_iterable(value: Any) -> bool:

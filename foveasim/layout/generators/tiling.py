@@ -11,7 +11,7 @@ import shapely
 
 from foveasim._core.calls import LENGTH
 from foveasim._core.user_warnings import warn
-from foveasim._core.validation import Floats, check_sites, finite_array
+from foveasim._core.validation import Floats, check_point, check_sites
 from foveasim.errors import GeometryError, LayoutWarning, ParameterError
 from foveasim.layout._regions import as_region, parse_region
 from foveasim.layout.drc.measurements import is_below_size
@@ -120,7 +120,7 @@ def tiling(
     """
     outline = parse_region(size_um=size_um, radius_um=radius_um, region=region)
     assert pitch_um is not None
-    origin = finite_array("origin_um", origin_um)
+    origin = np.array(check_point("origin_um", origin_um))
     if min_size_um is not None and border == "cut":
         rule = "must be omitted with border='cut', which retains all pieces"
         raise ParameterError("min_size_um", rule, min_size_um, "µm", "take border='merge'")

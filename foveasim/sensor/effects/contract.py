@@ -549,6 +549,7 @@ class AdditiveNoise(Effect):
         """Return the values plus a Gaussian draw."""
         from foveasim._core import _kernels
 
+        check_drawn(values, rng)
         _kernels.add_normals(values, sites.pattern(self, self.deviation), random_key(rng))
         return values
 
@@ -605,6 +606,14 @@ class GroupedNoise(AdditiveNoise):
     def linearise(self, mean: Floats, *, sites: Sites) -> StepModel:
         """Return the mean, the standard deviation and the groups."""
         return StepModel(mean, None, sites.pattern(self, self.deviation), self._groups(sites))
+
+
+def check_drawn(values: object, rng: object, *, is_drawn: bool = True) -> None:
+    """Check that a draw has an array to change, and a random stream."""
+    if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype != np.float64:
+        raise ParameterError("values", "must be a float64 array of shape (n,), which the draw overwrites", values)
+    if is_drawn and not isinstance(rng, np.random.Generator):
+        raise ParameterError("rng", "must be a numpy.random.Generator", rng)
 
 
 def _labels(effect: Effect, labels: ArrayLike, n_sites: int) -> Ints:

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from foveasim._core.calls import Declared, Limits
 from foveasim._core.random_streams import Streams, random_key
-from foveasim._core.validation import Floats, Ints, read_only, unmasked
+from foveasim._core.validation import Floats, Ints, as_broadcast, read_only, unmasked
 from foveasim.errors import ParameterError
 from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.effects.collection import MAX_CHARGE_E, ROUNDING_E2, Collection
-from foveasim.sensor.effects.contract import Sites, StepModel
+from foveasim.sensor.effects.contract import Sites, StepModel, check_drawn
 
 __all__ = ["MAX_CHARGE_E", "ROUNDING_E2", "PoissonTables", "ShotChoice", "ShotNoise", "draw_shot_noise"]
 
@@ -112,6 +112,7 @@ class ShotNoise(Declared, Collection):
         """Return the drawn charges, (n,) e-, in whole electrons."""
         from foveasim.sensor import _kernels
 
+        check_drawn(values, rng, is_drawn=self.is_drawn)
         if self.how == "auto":
             tables = poisson_tables(int(self.gaussian_above_e))
             _kernels.draw_poisson(values, self.gaussian_above_e, tables, random_key(rng))
@@ -123,6 +124,7 @@ class ShotNoise(Declared, Collection):
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites | None = None) -> tuple[Floats, Floats]:
         """Return the mean, and the variance plus shot noise, or plus rounding if not drawn."""
+        mean, variance = as_broadcast(mean=mean, variance=variance)
         return mean, variance + (np.maximum(mean, 0.0) if self.is_drawn else ROUNDING_E2)
 
     def linearise(self, mean: Floats, *, sites: Sites | None = None) -> StepModel:
@@ -137,6 +139,7 @@ class ShotNoise(Declared, Collection):
         """
         from scipy.special import pdtr
 
+        count, mean = as_broadcast(count=count, mean=mean)
         if not self.is_drawn:
             return (count >= np.rint(mean)).astype(np.float64)
         return np.asarray(np.where(mean > 0.0, pdtr(count, np.maximum(mean, 1e-300)), 1.0))

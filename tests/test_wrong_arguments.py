@@ -1,10 +1,11 @@
-"""Infinity, NaN and huge counts as arguments of all public functions: rejected, or allowed for a reason."""
+"""Wrong numbers, shapes and types as arguments of all public functions: rejected, or allowed for a reason."""
 
 from __future__ import annotations
 
 import inspect
 import signal
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -30,8 +31,17 @@ def values_for(kind, plausible):
     return {"huge": HUGE} if "float" not in text else {"inf": np.inf, "NaN": np.nan}
 
 
-def outcomes():
-    """Yield calls, parameters and values with their outcomes, for calls that work with plausible arguments."""
+#: One of these replaces each argument: of wrong type, shape, sign or size for most.
+WRONG = {
+    "infinity": lambda: np.inf, "NaN": lambda: np.nan, "huge": lambda: HUGE, "negative": lambda: -1, "zero": lambda: 0,
+    "fraction": lambda: 1.5, "text": lambda: "x", "None": lambda: None, "no items": list, "three": lambda: np.ones(3),
+    "two by two": lambda: np.ones((2, 2)), "no numbers": lambda: np.empty(0), "object": object, "mapping": dict,
+    "tuple": lambda: (1.0, 2.0, 3.0),
+}  # fmt: skip
+
+
+def working_calls():
+    """Yield calls that work with plausible arguments: name, call, these arguments, and the values of all parameters."""
     objects = make_objects()
     for name, call, owner in public_calls():
         bound = next((each for each in objects if owner is not None and isinstance(each, owner)), None)
@@ -40,24 +50,29 @@ def outcomes():
         parameters = list(inspect.signature(call).parameters.values())[0 if owner is None else 1 :]
         parameters = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
         kinds = annotations_of(call)
-        usual = {p.name: example(kinds.get(p.name), objects) for p in parameters if p.default is p.empty}
-        arguments = () if owner is None else (bound,)
-        if outcome(call, arguments, usual) != "accepted":
-            continue
-        for parameter in parameters:
-            plausible = usual.get(parameter.name, example(kinds.get(parameter.name), objects))
-            for what, value in values_for(kinds.get(parameter.name), plausible).items():
-                yield name, parameter.name, what, outcome(call, arguments, usual | {parameter.name: value})
+        plausible = {p.name: (kinds.get(p.name), example(kinds.get(p.name), objects)) for p in parameters}
+        usual = {p.name: plausible[p.name][1] for p in parameters if p.default is p.empty}
+        with_object = call if owner is None else partial(call, bound)
+        if outcome(with_object, usual) == "accepted":
+            yield name, with_object, usual, plausible
 
 
-def outcome(call, arguments, values):
+def outcomes():
+    """Yield calls, parameters and invalid numbers with their outcomes."""
+    for name, call, usual, plausible in working_calls():
+        for parameter, (kind, value) in plausible.items():
+            for what, wrong in values_for(kind, value).items():
+                yield name, parameter, what, outcome(call, usual | {parameter: wrong})
+
+
+def outcome(call, values):
     def stop(*_):
         raise TimeoutError
 
     before = signal.signal(signal.SIGALRM, stop)
     signal.alarm(LIMIT_S)
     try:
-        call(*arguments, **values)
+        call(**values)
     except FoveasimError:
         return "rejected"
     except Exception as error:  # noqa: BLE001 -- compared
@@ -132,6 +147,26 @@ def test_infinite_numbers_are_rejected_or_allowed(tmp_path, monkeypatch):
     assert len({name for name, *_ in found}) > 180
     assert sum(each[3] == "rejected" for each in found) > 500
     assert wrong == []
+
+
+def test_wrong_arguments_have_clear_errors(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    n_calls, found, changed = 0, [], []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name, call, usual, plausible in working_calls():
+            n_calls += 1
+            for parameter in plausible:
+                for what, make in WRONG.items():
+                    value = make()
+                    found.append((name, parameter, what, outcome(call, usual | {parameter: value})))
+                    if isinstance(value, np.ndarray) and not value.flags.writeable:
+                        changed.append((name, parameter))
+
+    assert n_calls > 280
+    assert sum(each[3] == "rejected" for each in found) > 11_000
+    assert [each for each in found if each[3] not in ("accepted", "rejected")] == []
+    assert changed == []
 
 
 LAYOUT = fs.layout.grid(4, 4, 3.0)
