@@ -404,6 +404,7 @@ def compare(
     frames_per_s: FramesPerS = None,
     max_pixels: Annotated[int, typer.Option("--pixels", help="Longer side of the pictures.")] = 256,
     annuli: Annotated[int, typer.Option("--annuli", help="Number of annuli around the optical axis.")] = 8,
+    metrics: Annotated[list[str] | None, typer.Option("--metric", help="Name of a further metric; repeatable.")] = None,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the noise.")] = 0,
 ) -> None:
     """Compare layouts or shots at equal budget, and write a report."""
@@ -422,6 +423,7 @@ def compare(
             frames_per_s=frames_per_s,
             max_pixels=max_pixels,
             n_annuli=annuli,
+            metrics=metrics or (),
             seed=seed,
             progress=progress,
         )

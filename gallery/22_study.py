@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 
 import foveasim as fs
 from foveasim.config import Shot
-from foveasim.explore import METRICS, study
+from foveasim.explore import study
+from foveasim.metrics import METRICS
 from foveasim.view import save_figure
 
 FIELD_RADIUS_UM = 250.0

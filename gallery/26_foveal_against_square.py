@@ -26,7 +26,7 @@ FIELD_UM = 720.0
 MIN_SIZE_UM = 2.0
 #: Photosites for a test of the script.
 QUICK = {"n_sites": 1681}
-MEASURES = ("psnr_db", "snr_db", "information_bit_per_mm2")
+METRICS = ("psnr_db", "snr_mean_db", "information_bit_per_mm2")
 
 
 def compare(n_sites: int) -> fs.compare.Comparison:
@@ -53,7 +53,7 @@ def draw(found: fs.compare.Comparison) -> Figure:
         grey = fs.units.encode_srgb(np.clip(picture.data[0] / white, 0.0, 1.0))
         one.imshow(grey, cmap="gray", origin="lower", vmin=0.0, vmax=1.0)
         one.set(title=title, xticks=[], yticks=[])
-    for one, name in zip(axes[1], MEASURES, strict=True):
+    for one, name in zip(axes[1], METRICS, strict=True):
         draw_measure(found, name, one)
         one.grid(color="0.92")
     axes[1, 0].legend(frameon=False)

@@ -32,10 +32,12 @@ exposure_s: 0.01
 """
 PROGRAM = """
 import json, sys
+from types import SimpleNamespace
 import numpy as np
 import foveasim as fs
+from foveasim.studio._parts.requirements import requirements
 from foveasim.config import read_shot, schema
-from foveasim.explore import METRICS
+from foveasim.metrics import METRICS
 from foveasim.testing import check_extension, extensions
 
 shot = read_shot("shot.yaml")
@@ -53,7 +55,26 @@ names = {"daisy", "stretch_x", "min_roundness", "boxes", "pad", "powers", "lines
 own = [found for found in extensions() if found[1] in names]
 for kind, name in own:
     check_extension(kind, name)
+name, settings = "darkest_code_dn", fs.config.read_settings("shot.yaml")
+swept = fs.explore.sweep("shot.yaml", {"sensor.bits": [8, 10]}, metrics=[name], workers=0)
+studied = fs.explore.study("shot.yaml", {"exposure_s": (0.01, 0.02)}, {name: "maximize"}, n_trials=2, workers=0)
+limited = fs.config.build_shot("shot.yaml", {**settings, "requirements": [{"measure": name, "at_least": 0.0, "site": 3}]})
+goal = fs.config.Requirement(measure=name, at_most=1e9)
+compared = fs.compare.cameras({"one": shot.camera, "other": shot.camera}, {"moon": shot.scene}, exposure_s=0.01, n_annuli=2,
+                              max_pixels=16, metrics=[name])
+compared.write("report.html")
+rows, _ = requirements(SimpleNamespace(shot=limited, capture=capture))
+uses = {
+    "sweep": swept[name].values.tolist()[1] >= 0,
+    "study": len(studied.trials) == 2 and studied.best_value >= 0,
+    "requirement": fs.explore.check_requirements(limited, capture)[0].value == capture.code[3],
+    "goal seek": fs.explore.solve("shot.yaml", "exposure_s", goal, bounds=(0.01, 0.02)).result >= 0,
+    "comparison": compared.values[name][0, 0] == capture.code.min() and "lowest code" in open("report.html").read().lower(),
+    "studio": {"name": name, "label": "lowest code / DN", "unit": "DN", "has_region": True, "is_cost": False} in rows["measures"],
+    "schema": name in json.dumps(fs.explore.schema_of("sweep")),
+}
 print(json.dumps({
+    "uses of the metric": sorted(use for use, is_right in uses.items() if is_right),
     "checked": len({kind for kind, _ in own}) == len({kind for kind, _ in extensions()}) == len(own) - 1,
     "generator": capture.layout.provenance["generator"],
     "effects": [effect.name for effect in shot.camera.sensor.chain],
@@ -89,6 +110,7 @@ def extended(tmp_path_factory):
 def test_installed_package_extends_every_kind(extended):
     assert extended.returncode == 0, extended.stderr
     assert json.loads(extended.stdout) == {
+        "uses of the metric": ["comparison", "goal seek", "requirement", "schema", "studio", "study", "sweep"],
         "checked": True,
         "generator": "daisy",
         "effects": ["shot", "read", "supply_ripple"],

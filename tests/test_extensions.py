@@ -14,9 +14,9 @@ from registries import restored
 import foveasim as fs
 from foveasim.distortion import LENSES
 from foveasim.errors import ParameterError
-from foveasim.explore import METRICS
 from foveasim.layout import DERIVED_LAYERS, EDITS, FORMATS, LAYOUTS, RULES, FileFormat, LayoutLayer, Rule, layout_family
 from foveasim.maps import MAP_FORMATS, Found
+from foveasim.metrics import METRICS
 from foveasim.optics import PSF_FORMATS, PUPILS, PSFGrid, PupilEdges
 from foveasim.scene import CUBE_FORMATS, SCENES
 from foveasim.sensor import PIXEL_OPTICS, Footprints, PixelOptics

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
@@ -64,24 +64,32 @@ class Registry(Mapping[str, T], Generic[T]):
     group : str
         Group of entry points, such as "foveasim.layouts"; the name of an entry point is the name of its object. Entry points
         are loaded when the registry is first read. An entry point that fails to load is logged as a warning and skipped.
+    modules : sequence of str
+        Modules that register further objects, imported when the registry is first read.
     """
 
-    def __init__(self, kind: str, group: str) -> None:
+    def __init__(self, kind: str, group: str, modules: Sequence[str] = ()) -> None:
         self.kind: str = kind
         self.group: str = group
         self._objects: dict[str, T] = {}
         self._examples: dict[str, _Example] = {}
+        self._info: dict[str, Any] = {}
+        self._modules = tuple(modules)
         self._is_complete = False
         #: Number of registrations so far; data derived from a registry are rebuilt when it changes.
         self.version: int = 0
 
     @overload
-    def register(self, name: str, item: T, *, example: Any = None, expected: Any = None) -> T: ...
+    def register(self, name: str, item: T, *, example: Any = None, expected: Any = None, info: Any = None) -> T: ...
 
     @overload
-    def register(self, name: str, *, example: Any = None, expected: Any = None) -> Callable[[F], F]: ...
+    def register(
+        self, name: str, *, example: Any = None, expected: Any = None, info: Any = None
+    ) -> Callable[[F], F]: ...
 
-    def register(self, name: str, item: Any = None, *, example: Any = None, expected: Any = None) -> Any:
+    def register(
+        self, name: str, item: Any = None, *, example: Any = None, expected: Any = None, info: Any = None
+    ) -> Any:
         """
         Register an object, or return a decorator that does.
 
@@ -96,6 +104,8 @@ class Registry(Mapping[str, T], Generic[T]):
             examples of all kinds.
         expected : object, optional
             Known result of the example, in the form of the kind.
+        info : object, optional
+            Facts about the object, in the form of the kind, such as :class:`foveasim.metrics.MetricInfo`.
 
         Raises
         ------
@@ -103,14 +113,17 @@ class Registry(Mapping[str, T], Generic[T]):
             When another object has this name.
         """
         if item is None:
-            return lambda decorated: self.register(name, decorated, example=example, expected=expected)
+            return lambda decorated: self.register(name, decorated, example=example, expected=expected, info=info)
         if name in self._objects and _identity(self._objects[name]) != _identity(item):
             raise ParameterError("name", f"must be new: another {self.kind} has this name", name)
         if name not in self._objects:
-            self._examples.pop(name, None)  # of an object that was removed
+            for facts in (self._examples, self._info):  # of an object that was removed
+                facts.pop(name, None)
         self._objects[name] = item
         if example is not None or expected is not None:  # an entry point has the example of its decorator
             self._examples[name] = _Example({} if example is None else example, expected)
+        if info is not None:
+            self._info[name] = info
         self.version += 1
         return item
 
@@ -131,9 +144,16 @@ class Registry(Mapping[str, T], Generic[T]):
         """Return the known result of the example of an object, or None."""
         return self._examples.get(name, _Example()).expected
 
+    def info(self, name: str) -> Any:
+        """Return the facts with which an object was registered, or None."""
+        self._all()
+        return self._info.get(name)
+
     def _all(self) -> dict[str, T]:
         if not self._is_complete:
             self._is_complete = True
+            for module in self._modules:
+                import_module(module)
             for point in _entry_points().select(group=self.group):
                 try:
                     self.register(point.name, point.load())

@@ -17,15 +17,12 @@ from foveasim.compare.information import (
     site_information_bits,
 )
 from foveasim.compare.intervals import MedianInterval, median_interval
-from foveasim.compare.measure import MEASURES, Measure
 from foveasim.compare.setup import default_sensor, photograph_scenes
 
 __all__ = [
     "BUDGETS",
-    "MEASURES",
     "Budget",
     "Comparison",
-    "Measure",
     "MedianInterval",
     "PictureQuality",
     "SceneCovariance",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import count
@@ -19,31 +18,44 @@ from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.validation import Floats, check_choice, check_number, check_point, read_only
 from foveasim.camera import Camera
 from foveasim.camera._framing import different_part
-from foveasim.compare.annuli import Annuli, quality_by_eccentricity
+from foveasim.compare._light import (
+    behind_image,
+    e_per_photon,
+    field_of,
+    image_of,
+    mean_spectrum,
+    photons_per_um2,
+    with_angular_response,
+)
+from foveasim.compare.annuli import quality_by_eccentricity
 from foveasim.compare.budgets import BUDGETS, Budget, budget_of, budget_rows, check_equal_budgets
 from foveasim.compare.information import scene_covariance
 from foveasim.compare.intervals import MedianInterval, median_interval
 from foveasim.compare.measure import (
-    MEASURES,
-    Wave,
+    BY_ECCENTRICITY,
+    COMPARED,
+    ComparedShot,
     best_cameras,
+    further_metrics,
     information_by_annulus,
     layout_measures,
-    measure_rows,
+    metric_rows,
     scene_measures,
     size_records,
+    wave_per_mm_of,
 )
 from foveasim.compare.setup import DEFAULT_EXPOSURE_S, cameras_of, field_um, photograph_scenes
 from foveasim.compare.verdict import verdict_lines
 from foveasim.errors import ParameterError, format_value
-from foveasim.fields import Grid, PowerMap
+from foveasim.fields import PowerMap
 from foveasim.layout import Layout
+from foveasim.metrics.registry import check_number_name, metric_info
+from foveasim.metrics.shots.resolution import wave_of
 from foveasim.optics import Optics
-from foveasim.reconstruct import Picture, reference
+from foveasim.reconstruct import Picture
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor
 from foveasim.sensor.model.linearisation import Linearisation
-from foveasim.units import per_mm_from_per_um, photon_energy_j, w_from_w_m2_um2
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -55,11 +67,6 @@ Method = Literal["cells", "linear", "natural", "least_squares"]
 
 #: Coverage from which a pixel belongs to a camera's picture.
 MIN_COVERAGE = 0.5
-#: Images whose covariance is fitted: pixels per side of the smallest site, smallest and largest number along the field.
-SITE_PIXELS, MIN_FIELD_PIXELS, MAX_FIELD_PIXELS = 4, 256, 2048
-#: Frequency of the waves for aliases, in Nyquist frequencies of a square grid; relative margin of the outermost annulus.
-WAVE_NYQUISTS, EDGE_ROUNDING = 1.5, 1e-9
-BY_ECCENTRICITY = "_by_eccentricity"
 #: Explanation of a mark in tables.
 BEST_NOTE = "* best value of the row"
 
@@ -74,6 +81,8 @@ class Comparison:
     names : tuple of str
         Names of the cameras.
     scenes : tuple of str
+    metrics : tuple of str
+        Names in :data:`foveasim.metrics.METRICS`.
     budgets : tuple of Budget
         One per camera.
     edges_um : (n_annulus + 1,) float64, µm
@@ -81,7 +90,7 @@ class Comparison:
     centre_um : (x, y), µm
         Fixation point.
     values : mapping of str to array
-        Measures by name: (n_camera, n_scene) or (n_camera,); and ``NAME_by_eccentricity`` with an axis of annuli.
+        Metrics by name: (n_camera, n_scene) or (n_camera,); and ``NAME_by_eccentricity`` with an axis of annuli.
     coverage_fraction : (n_camera,) float64
         Fraction of the common field, the pixels that any camera covers, that each camera covers.
     compared_fraction : float
@@ -98,6 +107,7 @@ class Comparison:
 
     names: tuple[str, ...]
     scenes: tuple[str, ...]
+    metrics: tuple[str, ...] = COMPARED
     budgets: tuple[Budget, ...]
     edges_um: Floats
     centre_um: tuple[float, float]
@@ -114,12 +124,12 @@ class Comparison:
 
     def summary(self, name: str, *, by_eccentricity: bool = False) -> MedianInterval:
         """
-        Return the median of a measure over the scenes, and its confidence interval.
+        Return the median of a metric over the scenes, and its confidence interval.
 
         Parameters
         ----------
         name : str
-            A name in :data:`MEASURES`.
+            A name in :attr:`metrics`.
         by_eccentricity : bool
             Whether to return values per annulus.
 
@@ -127,7 +137,7 @@ class Comparison:
         -------
         median, low, high : (n_camera,) or (n_camera, n_annulus) float64
             With a 95 % interval for the median of the population of scenes, for any distribution (:func:`median_interval`).
-            Its bounds are NaN for fewer than five scenes, and the value itself for measures of layouts.
+            Its bounds are NaN for fewer than five scenes, and the value itself for metrics of layouts.
         """
         return self._interval(name, by_eccentricity, is_difference=False)
 
@@ -148,8 +158,8 @@ class Comparison:
         return self._interval(name, by_eccentricity, is_difference=True)
 
     def _interval(self, name: str, by_eccentricity: bool, *, is_difference: bool) -> MedianInterval:
-        """Return the interval of a measure or its differences; one value for layouts."""
-        has_scenes = MEASURES[check_choice("name", name, MEASURES)].has_scenes
+        """Return the interval of a metric or its differences; one value for layouts."""
+        has_scenes = metric_info(check_choice("name", name, self.metrics)).has_scene
         values = self.values[name + (BY_ECCENTRICITY if by_eccentricity else "")]
         if is_difference:
             with np.errstate(invalid="ignore"):  # infinite PSNR of identical pictures
@@ -169,7 +179,7 @@ class Comparison:
         return verdict_lines(self)
 
     def records(self) -> list[dict[str, Any]]:
-        """Return one dict per camera, with its budget, its coverage and all measures."""
+        """Return one dict per camera, with its budget, its coverage and all metrics."""
         rows = []
         for k, name in enumerate(self.names):
             row: dict[str, Any] = {
@@ -177,11 +187,11 @@ class Comparison:
                 **asdict(self.budgets[k]),
                 "coverage_fraction": float(self.coverage_fraction[k]),
             }
-            for measure in MEASURES:
-                median, low, high = self.summary(measure)
-                row[measure] = float(median[k])
-                if MEASURES[measure].has_scenes:
-                    row[f"{measure}_low"], row[f"{measure}_high"] = float(low[k]), float(high[k])
+            for metric in self.metrics:
+                median, low, high = self.summary(metric)
+                row[metric] = float(median[k])
+                if metric_info(metric).has_scene:
+                    row[f"{metric}_low"], row[f"{metric}_high"] = float(low[k]), float(high[k])
             rows.append(row)
         return rows
 
@@ -201,9 +211,10 @@ class Comparison:
         """
         xr = import_optional("to_xarray", "xarray", "maps")
         variables = {}
-        for name, measure in MEASURES.items():
-            dims = ("camera", "scene") if measure.has_scenes else ("camera",)
-            attributes = {"units": measure.unit or "1", "long_name": measure.title}
+        for name in self.metrics:
+            info = metric_info(name)
+            dims = ("camera", "scene") if info.has_scene else ("camera",)
+            attributes = {"units": info.unit or "1", "long_name": info.title}
             variables[name] = (dims, self.values[name], attributes)
             variables[name + BY_ECCENTRICITY] = ((*dims, "annulus"), self.values[name + BY_ECCENTRICITY], attributes)
         variables["coverage_fraction"] = (("camera",), self.coverage_fraction, {"units": "1"})
@@ -216,15 +227,18 @@ class Comparison:
         for attribute, _, unit in BUDGETS.values():
             numbers = [getattr(budget, attribute) for budget in self.budgets]
             coordinates[attribute] = ("camera", numbers, {"units": unit or "1"})
+        variables = {
+            name: each for name, each in variables.items() if name not in coordinates
+        }  # metrics that are budgets
         return xr.Dataset(variables, coordinates, {"settings": json.dumps(self.settings)})
 
     def plot(self) -> NDArray[Any]:
         """
-        Draw all measures against eccentricity, and the areas of size classes.
+        Draw all metrics against eccentricity, and the areas of size classes.
 
         Returns
         -------
-        axes : (n_measure + 1,) array of matplotlib axes
+        axes : (n_metric + 1,) array of matplotlib axes
             Of a new figure, with confidence intervals.
         """
         from foveasim.compare.figures import overview
@@ -278,8 +292,8 @@ class Comparison:
     def _rows(self) -> list[list[str]]:
         """Return title and one value per camera of each row of the table."""
         coverage = ["coverage of the field / %", *(f"{100.0 * part:.1f}" for part in self.coverage_fraction)]
-        rows = measure_rows(self.summary)
-        for row, best in zip(rows, best_cameras(self.summary), strict=True):
+        rows = metric_rows(self.metrics, self.summary)
+        for row, best in zip(rows, best_cameras(self.metrics, self.summary), strict=True):
             if best is not None:
                 row[best + 1] += " *"
         return [*budget_rows(self.budgets), coverage, *rows]
@@ -298,6 +312,7 @@ def cameras(
     n_annuli: Annotated[int, Limits(at_least=1, at_most=1000)] = 8,
     max_pixels: Annotated[int, Limits(at_least=16, at_most=4096)] = 256,
     method: Method = "cells",
+    metrics: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> Comparison:
     """
@@ -326,6 +341,9 @@ def cameras(
         Pixels along the longer side of the pictures, which have a common grid.
     method : {"cells", "linear", "natural", "least_squares"}
         Reconstruction, as for :meth:`Capture.picture`.
+    metrics : sequence of str
+        Further metrics, by their names in :data:`foveasim.metrics.METRICS`. Those of some photosites are also computed by
+        annulus.
     progress : function of (n_done, n), optional
 
     Returns
@@ -360,6 +378,7 @@ def cameras(
     """
     named = _check_cameras(cameras)
     fixation = check_point("centre_um", centre_um)
+    metrics = tuple(dict.fromkeys(check_number_name("metrics", name) for name in metrics if name not in COMPARED))
     budgets = {name: budget_of(camera, _rate(frames_per_s, name, exposure_s)) for name, camera in named.items()}
     check_equal_budgets(budgets, budget, tolerance)
     first = next(iter(named.values()))  # its lens is that of all cameras
@@ -379,19 +398,20 @@ def cameras(
         if progress is not None:
             progress(next(steps), len(named) * (len(lights) + 1))
 
-    annuli, grid, covariance_grid = _field(list(named.values()), fixation, n_annuli, max_pixels)
+    annuli, grid, covariance_grid = field_of(list(named.values()), fixation, n_annuli, max_pixels)
     shots: dict[str, list[_Shot]] = {name: [] for name in named}
     photons, spectra = [], []
     for light in lights.values():
         maps: dict[tuple[float, float], PowerMap] = {}  # by the direction of cameras that turn
-        photons.append(_photons_per_um2(_image(first.at((0.0, 0.0)), light, maps), covariance_grid, exposure_s))
-        spectra.append(_mean_spectrum(maps[0.0, 0.0], covariance_grid))
+        photons.append(photons_per_um2(image_of(first.at((0.0, 0.0)), light, maps), covariance_grid, exposure_s))
+        spectra.append(mean_spectrum(maps[0.0, 0.0], covariance_grid))
         for name, camera in named.items():
             capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
-            known = _with_angular_response(camera, light)
+            known = with_angular_response(camera, light)
             picture = capture.picture(method, of="light_e", per="um2", grid=grid, sensor=known)
             ideal = camera.reference(light, grid, exposure_s=exposure_s)
-            model, own_measures = scene_measures(_behind_image(camera), capture, _image(camera, light, maps), annuli)
+            model, own_measures = scene_measures(behind_image(camera), capture, image_of(camera, light, maps), annuli)
+            own_measures |= further_metrics(metrics, ComparedShot(light, camera, exposure_s), capture, annuli)
             shots[name].append(_Shot(picture, ideal, model, known.light_response(), own_measures))
             advance()
     covered = [one[0].picture.coverage >= MIN_COVERAGE for one in shots.values()]
@@ -400,33 +420,31 @@ def cameras(
         raise ParameterError("cameras", "must have a common part of the field; the layouts do not overlap")
     covariance = scene_covariance(np.array(photons), covariance_grid.pitch_x_um)
     n_sites, area_um2 = (sum(getattr(one, part) for one in budgets.values()) for part in ("n_sites", "area_um2"))
-    wave_per_mm = WAVE_NYQUISTS * float(per_mm_from_per_um(0.5 * np.sqrt(n_sites / area_um2)))
-    values: dict[str, list[Any]] = {key: [] for name in MEASURES for key in (name, name + BY_ECCENTRICITY)}
+    wave_per_mm = wave_per_mm_of(n_sites, area_um2)
+    values: dict[str, list[Any]] = {key: [] for name in (*COMPARED, *metrics) for key in (name, name + BY_ECCENTRICITY)}
     pictures: dict[str, list[Picture]] = {}
     ideals: dict[str, list[Picture]] = {}
-    waves = sorted(
-        {
-            Wave(float(np.mean(light.wavelength_nm)), float(light.distance_m) if isinstance(light, Scene) else math.inf)
-            for light in lights.values()
-        }
-    )
+    waves = sorted({wave_of(light) for light in lights.values()})
     for name, camera in named.items():
         own = shots[name]
         qualities = [
             quality_by_eccentricity(one.picture, one.ideal, **annuli._asdict(), is_compared=is_common) for one in own
         ]
-        e_per_photon = _e_per_photon(camera.sensor, spectra)
-        responses = [e_per_photon[camera.sensor.filter_of_site] * one.response for one in own]
+        per_photon = e_per_photon(camera.sensor, spectra)
+        responses = [per_photon[camera.sensor.filter_of_site] * one.response for one in own]
         measures = [quality._asdict() | one.measures for quality, one in zip(qualities, own, strict=True)]
         found = (
             {key: [one[key] for one in measures] for key in measures[0]}
             | information_by_annulus(camera, covariance, responses, [one.model for one in own], annuli)
             | layout_measures(camera, waves, annuli, wave_per_mm)
         )
+        for metric in metrics:
+            if not metric_info(metric).has_scene:
+                found |= {key: found[key][0] for key in (metric, metric + BY_ECCENTRICITY)}
         for key, rows in values.items():
             rows.append(found[key])
         # Pictures of sensors of other sensitivity have the same white.
-        scale = 1.0 / e_per_photon.mean()
+        scale = 1.0 / per_photon.mean()
         pictures[name] = [
             _scaled(one.picture, scale * quality.gain) for quality, one in zip(qualities, own, strict=True)
         ]
@@ -436,6 +454,7 @@ def cameras(
     return Comparison(
         names=tuple(named),
         scenes=tuple(lights),
+        metrics=(*COMPARED, *metrics),
         budgets=tuple(budgets.values()),
         edges_um=read_only(annuli.edges_um),
         centre_um=fixation,
@@ -468,63 +487,8 @@ def cameras(
     )
 
 
-def _with_angular_response(camera: Camera, light: Scene | PowerMap) -> Sensor:
-    """Return the sensor with its known response to cones of light, for corrections."""
-    if camera.sensor.pixel_optics is None:
-        return camera.sensor
-    return camera.sensor.with_angular_response(camera.angular_response(light))
-
-
-def _image(camera: Camera, light: Scene | PowerMap, maps: dict[tuple[float, float], PowerMap]) -> PowerMap:
-    """
-    Return the ideal image that a camera sees.
-
-    ``maps``: images by the direction of the camera, which are computed once.
-    """
-    turned_um = camera.gaze_um if camera.axis == "sensor" else (0.0, 0.0)
-    if turned_um not in maps:
-        maps[turned_um] = camera.power_map(light) if isinstance(light, Scene) else light
-    return maps[turned_um]
-
-
-def _photons_per_um2(image: PowerMap, grid: Grid, exposure_s: float) -> Floats:
-    """Return the mean number of photons per area of each pixel of a grid, (n_y, n_x)."""
-    per_w_m2 = float(w_from_w_m2_um2(exposure_s)) / photon_energy_j(image.wavelength_nm)
-    return np.asarray(reference(image, grid, weights=per_w_m2[np.newaxis]).data[0], np.float64)
-
-
-class _Spectrum(NamedTuple):
-    """Mean irradiance of each band of an image, W/m²."""
-
-    wavelength_nm: Floats
-    irradiance_w_m2: Floats
-
-
-def _mean_spectrum(image: PowerMap, grid: Grid) -> _Spectrum:
-    """Return the mean spectrum of an image in a field; in all of it if it has no part there."""
-    x0_um, y0_um, x1_um, y1_um = grid.bounds_um
-    is_x, is_y = (
-        (low <= at) & (at <= high)
-        for low, at, high in ((x0_um, image.grid.x_um, x1_um), (y0_um, image.grid.y_um, y1_um))
-    )
-    cells = image.data[:, is_y][:, :, is_x] if is_x.any() and is_y.any() else image.data
-    return _Spectrum(image.wavelength_nm, cells.mean(axis=(1, 2), dtype=np.float64))
-
-
-def _e_per_photon(sensor: Sensor, spectra: Sequence[_Spectrum]) -> Floats:
-    """Return the electrons of each filter per photon of the sum of spectra."""
-    electrons = sum(sensor.responsivity_e_per_j(one.wavelength_nm) @ one.irradiance_w_m2 for one in spectra)
-    n_photons = sum(float((one.irradiance_w_m2 / photon_energy_j(one.wavelength_nm)).sum()) for one in spectra)
-    return np.asarray(electrons / n_photons, np.float64)
-
-
 def _scaled(picture: Picture, factor: float) -> Picture:
     return replace(picture, data=(factor * picture.data).astype(np.float32))
-
-
-def _behind_image(camera: Camera) -> Camera:
-    """Return a camera for its own power maps, which already have its gaze if it turns."""
-    return camera if camera.axis == "image" else camera.at((0.0, 0.0))
 
 
 class _Shot(NamedTuple):
@@ -535,25 +499,6 @@ class _Shot(NamedTuple):
     model: Linearisation
     response: Floats
     measures: dict[str, Any]
-
-
-def _field(
-    cameras: Sequence[Camera], centre_um: tuple[float, float], n_annuli: int, max_pixels: int
-) -> tuple[Annuli, Grid, Grid]:
-    """Return annuli and picture grid of the common field, and the image grid for covariances."""
-    all_layouts = [camera.layout for camera in cameras]
-    bounds_um = np.array([layout.bounds_um for layout in all_layouts])
-    low, high = bounds_um[:, :2].min(axis=0), bounds_um[:, 2:].max(axis=0)
-    seen_um = bounds_um + np.tile([camera.gaze_um for camera in cameras], 2)
-    low_seen, high_seen = seen_um[:, :2].min(axis=0), seen_um[:, 2:].max(axis=0)
-    site_um = min(math.sqrt(float(layout.area_um2.min())) for layout in all_layouts)
-    n_pixels = math.ceil(SITE_PIXELS * float((high_seen - low_seen).max()) / site_um)
-    reach_um = max(float(np.hypot(*(layout.centroid_um - centre_um).T).max()) for layout in all_layouts)
-    return (
-        Annuli(centre_um, np.linspace(0.0, reach_um * (1.0 + EDGE_ROUNDING), n_annuli + 1)),
-        _grid(low, high, max_pixels),
-        _grid(low_seen, high_seen, min(max(n_pixels, MIN_FIELD_PIXELS), MAX_FIELD_PIXELS)),
-    )
 
 
 def layouts(
@@ -631,13 +576,3 @@ def _rate(frames_per_s: float | Mapping[str, float] | None, name: str, exposure_
             raise ParameterError("frames_per_s", f"must have a rate for {format_value(name)}", list(frames_per_s))
         frames_per_s = frames_per_s[name]
     return check_number("frames_per_s", frames_per_s, above=0.0)
-
-
-def _grid(low: NDArray[np.float64], high: NDArray[np.float64], max_pixels: int) -> Grid:
-    """Return a grid of square pixels over a rectangle."""
-    pitch_um = float((high - low).max()) / max_pixels
-    n_x, n_y = (int(np.ceil(length / pitch_um - 1e-6)) for length in high - low)
-    centre = 0.5 * (low + high)
-    return Grid(
-        (n_y, n_x), pitch_um, (float(centre[0] - 0.5 * n_x * pitch_um), float(centre[1] - 0.5 * n_y * pitch_um))
-    )

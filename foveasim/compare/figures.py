@@ -1,4 +1,4 @@
-"""Figures of a comparison: measures against eccentricity, and area by size class."""
+"""Figures of a comparison: metrics against eccentricity, and area by size class."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.compare.intervals import with_unit
-from foveasim.compare.measure import MEASURES
 from foveasim.errors import printable
+from foveasim.metrics.registry import metric_info
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,29 +27,27 @@ __all__ = ["COLOURS", "draw_measure", "draw_sizes", "figure_of", "overview"]
 COLOURS = ("#2f7fd6", "#e0862a", "#1f9e77", "#c95fb0", "#8a8f2e", "#c8474b", "#7a68d8", "#4aa3b5")
 MARKERS = "osD^vP*X"
 FIGURE_INCHES = (4.7, 3.1)
-#: Measures with logarithmic axes.
-LOGARITHMIC = {"information_bit_per_mm2", "shift_sigma_um", "nyquist_per_mm", "mtf50_per_mm"}
 MAX_NAME = 28
 
 
 def draw_measure(comparison: Comparison, name: str, axes: Axes) -> None:
-    """Draw one measure of all cameras against eccentricity, with confidence intervals."""
-    measure = MEASURES[name]
+    """Draw one metric of all cameras against eccentricity, with confidence intervals."""
+    info = metric_info(name)
     intervals = comparison.summary(name, by_eccentricity=True)
     r_um = 0.5 * (comparison.edges_um[1:] + comparison.edges_um[:-1])
     for k, interval in enumerate(zip(*intervals, strict=True)):
         is_finite = np.isfinite(interval[0])
         x, y, low, high = (part[is_finite] for part in (r_um, *interval))
         axes.plot(x, y, linewidth=1.6, markersize=4, **_line_of(comparison, k))
-        if measure.has_scenes and np.isfinite(high - low).any():
+        if info.has_scene and np.isfinite(high - low).any():
             axes.fill_between(x, low, high, color=COLOURS[k % len(COLOURS)], alpha=0.16, linewidth=0.0)
     finite = intervals.median[np.isfinite(intervals.median)]
-    if name in LOGARITHMIC and finite.size and (finite > 0.0).all():
+    if info.is_logarithmic and finite.size and (finite > 0.0).all():
         axes.set_yscale("log")
         axes.set_ylim(0.6 * finite.min(), 1.6 * finite.max())
         _label_plainly(axes.yaxis)
     axes.set_xlabel("eccentricity / µm")
-    axes.set_ylabel(with_unit(measure.title, measure.unit))
+    axes.set_ylabel(with_unit(info.title, info.unit))
     axes.set_xlim(0.0, comparison.edges_um[-1])
 
 
@@ -69,13 +67,16 @@ def draw_sizes(comparison: Comparison, axes: Axes) -> None:
 
 
 def overview(comparison: Comparison) -> NDArray[Any]:
-    """Draw all measures against eccentricity, and the size classes, on new axes."""
+    """Draw all metrics against eccentricity, and the size classes, on new axes."""
     from matplotlib import rc_context
 
     from foveasim.view.plots.figures import new_figure
 
     with rc_context({"text.parse_math": False}):
-        draws = [*(partial(draw_measure, comparison, name) for name in MEASURES), partial(draw_sizes, comparison)]
+        draws = [
+            *(partial(draw_measure, comparison, name) for name in comparison.metrics),
+            partial(draw_sizes, comparison),
+        ]
         n_columns = 3
         n_rows = math.ceil(len(draws) / n_columns)
         figure = new_figure((4.3 * n_columns, 2.9 * n_rows))

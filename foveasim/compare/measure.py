@@ -1,4 +1,4 @@
-"""Measures of one camera: of its layout, and of its captures of scenes."""
+"""Metrics of one camera in a comparison: of its layout, and of its captures of scenes."""
 
 from __future__ import annotations
 
@@ -6,46 +6,58 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.validation import Floats, Ints
+from foveasim._core.validation import Floats
 from foveasim.camera import Camera
 from foveasim.capture import Capture
+from foveasim.compare._light import (
+    behind_image,
+    e_per_photon,
+    field_of,
+    image_of,
+    mean_spectrum,
+    photons_per_um2,
+    with_angular_response,
+)
 from foveasim.compare.annuli import Annuli
-from foveasim.compare.information import SceneCovariance, site_information_bits
+from foveasim.compare.information import SceneCovariance, scene_covariance, site_information_bits
 from foveasim.compare.intervals import MedianInterval, format_interval, with_unit
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.fields import Grid, PowerMap
-from foveasim.metrics import (
-    aliasing_spectrum,
-    flow_bound,
-    nyquist_per_mm,
-    polygon_mtf,
-    size_classes_um,
+from foveasim.layout import DesignRules
+from foveasim.metrics import aliasing_spectrum, flow_bound, nyquist_per_mm, size_classes_um
+from foveasim.metrics.registry import METRICS, MetricInfo, MetricShot, metric_info, number_of, options_of
+from foveasim.metrics.shots.resolution import (
+    Wave,
+    aperture_and_lens_mtf50,
+    finite_median,
+    lens_curve,
+    lens_mtf,
+    wave_of,
 )
+from foveasim.scene import Scene
 from foveasim.sensor.model.linearisation import Linearisation
 from foveasim.sensor.signal_to_noise import site_signals
 from foveasim.units import per_mm_from_per_um
 
 __all__ = [
-    "MEASURES",
-    "Measure",
-    "Wave",
+    "BY_ECCENTRICITY",
+    "COMPARED",
+    "ComparedShot",
+    "best_cameras",
+    "further_metrics",
     "information_by_annulus",
     "layout_measures",
-    "measure_rows",
+    "metric_rows",
     "scene_measures",
     "size_records",
+    "wave_per_mm_of",
 ]
 
-#: Sites of an annulus that represent its aperture MTF, and directions of the waves.
-MTF_SITES, MTF_ANGLES_DEG = 24, (0.0, 45.0, 90.0, 135.0)
-#: Frequencies of the MTF, and the highest one in units of 1 / size of the smallest site.
-MTF_FREQUENCIES, MAX_FREQUENCY = 200, 1.5
 #: Smallest number of sites for the spectrum of a region.
 MIN_REGION_SITES = 12
 UM2_PER_MM2 = 1e6
@@ -53,64 +65,30 @@ UM2_PER_MM2 = 1e6
 SHIFT_CELLS, MAX_UNCOVERED_FRACTION = 0.05, 1e-9
 #: Relative difference of two charges up to which they are equal.
 ROUNDING = 1e-12
-#: Level of MTF50.
-HALF = 0.5
 
 
-class Wave(NamedTuple):
-    """Mean wavelength and distance of a scene, for the MTF of a lens."""
-
-    wavelength_nm: float
-    distance_m: float
-
-
-@dataclass(frozen=True)
-class Measure:
-    """
-    Title, unit and definition of a measure.
-
-    ``has_scenes``: whether it depends on the scene. ``is_better_low``: whether lower values are better.
-    """
-
-    title: str
-    unit: str
-    definition: str
-    has_scenes: bool
-    is_better_low: bool = False
+#: Metrics of comparisons; each also has a variable ``NAME_by_eccentricity``.
+COMPARED = (
+    "psnr_db",
+    "ssim",
+    "snr_mean_db",
+    "information_bit_per_site",
+    "information_bit_per_mm2",
+    "shift_sigma_um",
+    "nyquist_per_mm",
+    "mtf50_per_mm",
+    "alias_fraction",
+)
+BY_ECCENTRICITY = "_by_eccentricity"
+#: Frequency of the waves for aliases, in Nyquist frequencies of a square grid of as many sites.
+WAVE_NYQUISTS = 1.5
+#: Annuli around the optical axis of the metrics of one shot.
+N_ANNULI = 8
 
 
-#: Measures by the names of their variables; each also has a variable ``NAME_by_eccentricity``.
-MEASURES = {
-    "psnr_db": Measure(
-        "PSNR", "dB", "peak signal-to-noise ratio of the picture, with the range of the ideal picture as peak", True
-    ),
-    "ssim": Measure("SSIM", "", "structural similarity of the picture and the ideal picture", True),
-    "snr_db": Measure(
-        "SNR per site", "dB", "signal-to-noise ratio of a site, 0 if it is saturated, mean over the sites, 20 log₁₀", True
-    ),
-    "information_bit_per_site": Measure(
-        "information per site", "bit", "Gaussian estimate of the information about the scenes, per site", True
-    ),
-    "information_bit_per_mm2": Measure(
-        "information per area", "bit/mm²", "the same, per area of the sites", True
-    ),
-    "shift_sigma_um": Measure(
-        "precision of a shift", "µm", "smallest standard deviation of an estimated image shift, rms of x and y", True,
-        is_better_low=True,
-    ),
-    "nyquist_per_mm": Measure("Nyquist frequency", "1/mm", "median over the sites, from the spacing of their rows", False),
-    "mtf50_per_mm": Measure(
-        "MTF50", "1/mm", "frequency at which the product of optics and aperture MTF is one half", False
-    ),
-    "alias_fraction": Measure(
-        "alias contrast",
-        "",
-        "largest contrast of an alias of a sine wave along x, at 1.5 times the Nyquist frequency of a square grid with as many "
-        "sites per area as the cameras on average",
-        False,
-        is_better_low=True,
-    ),
-}  # fmt: skip
+def wave_per_mm_of(n_sites: int, area_um2: float) -> float:
+    """Return the frequency of the waves for aliases, from the number and the area of sites."""
+    return WAVE_NYQUISTS * float(per_mm_from_per_um(0.5 * np.sqrt(n_sites / area_um2)))
 
 
 def layout_measures(camera: Camera, waves: Sequence[Wave], annuli: Annuli, wave_per_mm: float) -> dict[str, Any]:
@@ -121,27 +99,27 @@ def layout_measures(camera: Camera, waves: Sequence[Wave], annuli: Annuli, wave_
     """
     layout = camera.layout
     annulus = annuli.index_of(layout.centroid_um)
-    (x_um, y_um), edges_um = annuli
     nyquist = nyquist_per_mm(layout)
-    frequency = np.linspace(
-        0.0, MAX_FREQUENCY * float(per_mm_from_per_um(1.0 / np.sqrt(layout.area_um2.min()))), MTF_FREQUENCIES
-    )
+    lens = lens_curve(camera.optics, layout, waves)
+    order = np.argsort(layout.area_um2, kind="stable")
+    by_annulus = [order[annulus[order] == k] for k in range(annuli.edges_um.size - 1)]
+    alias, alias_by_annulus = alias_fractions(camera, waves, annuli, wave_per_mm)
+    return {
+        "nyquist_per_mm": finite_median(nyquist),
+        "nyquist_per_mm_by_eccentricity": [finite_median(nyquist[sites]) for sites in by_annulus],
+        "mtf50_per_mm": aperture_and_lens_mtf50(layout, lens, order),
+        "mtf50_per_mm_by_eccentricity": [aperture_and_lens_mtf50(layout, lens, sites) for sites in by_annulus],
+        "alias_fraction": alias,
+        "alias_fraction_by_eccentricity": alias_by_annulus,
+    }
 
-    def lens_mtf(per_mm: Floats) -> Floats:
-        return np.asarray(
-            np.mean(
-                [camera.optics.mtf(per_mm, wave.wavelength_nm, distance_m=wave.distance_m) for wave in waves], axis=0
-            )
-        )
 
-    lens = lens_mtf(frequency)
-
-    def mtf50(sites: Ints) -> float:
-        if not sites.size:
-            return float("nan")
-        chosen = sites[np.linspace(0, sites.size - 1, min(MTF_SITES, sites.size)).astype(np.int64)]
-        apertures = [polygon_mtf(layout[chosen], frequency, angle_deg=angle).mean(axis=0) for angle in MTF_ANGLES_DEG]
-        return _first_crossing(frequency, lens * np.mean(apertures, axis=0))
+def alias_fractions(camera: Camera, waves: Sequence[Wave], annuli: Annuli, wave_per_mm: float) -> tuple[float, Floats]:
+    """Return the contrast of aliases of a wave along x, in total and by annulus."""
+    layout = camera.layout
+    annulus = annuli.index_of(layout.centroid_um)
+    (x_um, y_um), edges_um = annuli
+    contrast = float(lens_mtf(camera.optics, waves, np.array([wave_per_mm]))[0])
 
     def alias(middle_um: tuple[float, float], radius_um: float) -> float:
         if np.count_nonzero(np.hypot(*(layout.centroid_um - middle_um).T) < radius_um) < MIN_REGION_SITES:
@@ -150,10 +128,8 @@ def layout_measures(camera: Camera, waves: Sequence[Wave], annuli: Annuli, wave_
             found = aliasing_spectrum(layout, (wave_per_mm, 0.0), centre_um=middle_um, radius_um=radius_um)
         except ParameterError:
             return float("nan")  # too few sites
-        return found.alias_fraction * float(lens_mtf(np.array([wave_per_mm]))[0])
+        return found.alias_fraction * contrast
 
-    order = np.argsort(layout.area_um2, kind="stable")
-    by_annulus = [order[annulus[order] == k] for k in range(edges_um.size - 1)]
     ring_um = 0.5 * (edges_um[1:] + edges_um[:-1])
     # The innermost region is centred; others are to the right of the fixation point.
     centres = [(x_um + (r if k else 0.0), y_um) for k, r in enumerate(ring_um.tolist())]
@@ -162,16 +138,11 @@ def layout_measures(camera: Camera, waves: Sequence[Wave], annuli: Annuli, wave_
     ]
     alias_fraction = np.array([alias(c, r) for c, r in zip(centres, radii, strict=True)])
     # A larger region would contain waves of many local frequencies: the total is the mean over the area.
-    area_um2 = np.array([layout.area_um2[sites].sum() for sites in by_annulus])
+    order = np.argsort(layout.area_um2, kind="stable")
+    area_um2 = np.array([layout.area_um2[order[annulus[order] == k]].sum() for k in range(edges_um.size - 1)])
     weights = np.where(np.isfinite(alias_fraction), area_um2, 0.0)
-    return {
-        "nyquist_per_mm": _median(nyquist),
-        "nyquist_per_mm_by_eccentricity": [_median(nyquist[sites]) for sites in by_annulus],
-        "mtf50_per_mm": mtf50(order),
-        "mtf50_per_mm_by_eccentricity": [mtf50(sites) for sites in by_annulus],
-        "alias_fraction": np.nansum(weights * alias_fraction) / weights.sum() if weights.any() else math.nan,
-        "alias_fraction_by_eccentricity": alias_fraction,
-    }
+    total = np.nansum(weights * alias_fraction) / weights.sum() if weights.any() else math.nan
+    return total, alias_fraction
 
 
 def scene_measures(
@@ -194,8 +165,8 @@ def scene_measures(
     sigma_um[parts.regions] = _rms(parts.sigma_um)
     with np.errstate(divide="ignore"):
         return model, {
-            "snr_db": 20.0 * np.log10(ratio.mean()),
-            "snr_db_by_eccentricity": 20.0 * np.log10(annuli.means(ratio, annulus)),
+            "snr_mean_db": 20.0 * np.log10(ratio.mean()),
+            "snr_mean_db_by_eccentricity": 20.0 * np.log10(annuli.means(ratio, annulus)),
             "shift_sigma_um": _rms(flow_bound(gradient, model).sigma_um)[0],
             "shift_sigma_um_by_eccentricity": sigma_um,
         }
@@ -253,22 +224,124 @@ def information_by_annulus(
     }
 
 
-def measure_rows(interval_of: Callable[[str], MedianInterval]) -> list[list[str]]:
-    """Return title and one value per camera of each measure, from a function of its name."""
+@METRICS.register(
+    "shift_sigma_um",
+    info=MetricInfo(
+        title="precision of a shift",
+        unit="µm",
+        definition="smallest standard deviation of an estimated image shift, rms of x and y",
+        better="low",
+        is_logarithmic=True,
+    ),
+)
+def shift_sigma_um(shot: MetricShot, camera: Camera, capture: Capture) -> float:
+    """Return the Cramér-Rao bound for a shift of the known image, µm."""
+    light = camera.frame(shot.scene) if isinstance(shot.scene, Scene) else shot.scene
+    sensor, exposure_s = camera.sensor, shot.exposure_s
+    model = sensor.linearise(capture.expected_e, exposure_s=exposure_s)
+    gradient = _shift_gradients_e_per_um(behind_image(camera), image_of(camera, light, {}), exposure_s)
+    return float(_rms(flow_bound(gradient, model).sigma_um)[0])
+
+
+@METRICS.register(
+    "alias_fraction",
+    info=MetricInfo(
+        title="alias contrast",
+        definition=(
+            "largest contrast of an alias of a sine wave along x, at 1.5 times the Nyquist frequency of a square grid with as "
+            "many sites per area as the cameras on average"
+        ),
+        better="low",
+        has_scene=False,
+    ),
+)
+def alias_fraction(shot: MetricShot, camera: Camera, capture: Capture) -> float:
+    """Return the mean contrast of aliases over the area; NaN for too few sites."""
+    layout = capture.layout
+    annuli, _, _ = field_of([camera], (0.0, 0.0), N_ANNULI, 16)
+    wave_per_mm = wave_per_mm_of(layout.n_sites, layout.area_um2.sum())
+    return alias_fractions(camera, [wave_of(shot.scene)], annuli, wave_per_mm)[0]
+
+
+def _information(shot: MetricShot, camera: Camera, capture: Capture) -> dict[str, Any]:
+    """Return the information about scenes with the covariance of the shot's."""
+    light = camera.frame(shot.scene) if isinstance(shot.scene, Scene) else shot.scene
+    annuli, _, grid = field_of([camera], (0.0, 0.0), 1, 16)
+    image = image_of(camera.at((0.0, 0.0)), light, {})
+    covariance = scene_covariance(photons_per_um2(image, grid, shot.exposure_s)[np.newaxis], grid.pitch_x_um)
+    e_per_ph = e_per_photon(camera.sensor, [mean_spectrum(image, grid)])
+    response = e_per_ph[camera.sensor.filter_of_site] * with_angular_response(camera, light).light_response()
+    model = camera.sensor.linearise(capture.expected_e, exposure_s=shot.exposure_s)
+    return information_by_annulus(camera, covariance, [response], [model], annuli)
+
+
+@METRICS.register(
+    "information_bit_per_site",
+    info=MetricInfo(
+        title="information per site",
+        unit="bit",
+        definition="Gaussian estimate of the information about the scenes, per site",
+    ),
+)
+def information_bit_per_site(shot: MetricShot, camera: Camera, capture: Capture) -> float:
+    """Estimate the information about the scene, bit per site."""
+    return float(_information(shot, camera, capture)["information_bit_per_site"][0])
+
+
+@METRICS.register(
+    "information_bit_per_mm2",
+    info=MetricInfo(
+        title="information per area",
+        unit="bit/mm²",
+        definition="the same, per area of the sites",
+        is_logarithmic=True,
+    ),
+)
+def information_bit_per_mm2(shot: MetricShot, camera: Camera, capture: Capture) -> float:
+    """Estimate the information about the scene, bit per mm² of the sites."""
+    return float(_information(shot, camera, capture)["information_bit_per_mm2"][0])
+
+
+class ComparedShot(NamedTuple):
+    """A scene and a camera of a comparison, for metrics."""
+
+    scene: Scene | PowerMap
+    camera: Camera
+    exposure_s: float
+    rules: DesignRules | None = None
+
+
+def further_metrics(names: Sequence[str], shot: ComparedShot, capture: Capture, annuli: Annuli) -> dict[str, Any]:
+    """Return further metrics of a capture, in total and by annulus, NaN without sites."""
+    found: dict[str, Any] = {}
+    n_annuli = annuli.edges_um.size - 1
+    annulus = annuli.index_of(shot.camera.layout.centroid_um)
+    for name in names:
+        found[name] = number_of(name, shot, shot.camera, capture)
+        by_annulus = np.full(n_annuli, np.nan)
+        if "sites" in options_of(METRICS[name]):
+            for k in np.unique(annulus[annulus >= 0]).tolist():
+                by_annulus[k] = number_of(name, shot, shot.camera, capture, sites=np.flatnonzero(annulus == k))
+        found[name + BY_ECCENTRICITY] = by_annulus
+    return found
+
+
+def metric_rows(names: Sequence[str], interval_of: Callable[[str], MedianInterval]) -> list[list[str]]:
+    """Return title and one value per camera of each metric, from a function of its name."""
     return [
         [
-            with_unit(measure.title, measure.unit),
+            with_unit(info.title, info.unit),
             *(format_interval(*one) for one in zip(*interval_of(name), strict=True)),
         ]
-        for name, measure in MEASURES.items()
+        for name, info in ((name, metric_info(name)) for name in names)
     ]
 
 
-def best_cameras(interval_of: Callable[[str], MedianInterval]) -> list[int | None]:
-    """Return the camera with the best value of each measure; None if there are several."""
+def best_cameras(names: Sequence[str], interval_of: Callable[[str], MedianInterval]) -> list[int | None]:
+    """Return the camera with the best value of each metric; None if there are several."""
     found: list[int | None] = []
-    for name, measure in MEASURES.items():
-        values = (-1.0 if measure.is_better_low else 1.0) * np.asarray(interval_of(name).median, np.float64)
+    for name in names:
+        values = (-1.0 if metric_info(name).better == "low" else 1.0) * np.asarray(interval_of(name).median, np.float64)
         best = np.flatnonzero(values == values.max(initial=-np.inf))
         found.append(int(best[0]) if best.size == 1 else None)
     return found
@@ -285,17 +358,3 @@ def size_records(camera: Camera) -> list[dict[str, Any]]:
 
 def _rms(values: NDArray[np.float64]) -> Floats:
     return np.sqrt(np.mean(np.square(values), axis=-1))
-
-
-def _median(values: NDArray[np.float64]) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else float("nan")
-
-
-def _first_crossing(frequency_per_mm: Floats, mtf: Floats) -> float:
-    """Return the first frequency at which an MTF falls to one half; NaN if it does not."""
-    below = np.flatnonzero(mtf < HALF)
-    if not below.size:
-        return math.nan
-    around = slice(max(below[0] - 1, 0), below[0] + 1)
-    return float(np.interp(-HALF, -mtf[around], frequency_per_mm[around]))

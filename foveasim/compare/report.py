@@ -13,7 +13,8 @@ from foveasim._core.quantities import format_quantity
 from foveasim.compare.budgets import BUDGETS, budget_rows
 from foveasim.compare.figures import draw_measure, draw_sizes, figure_of
 from foveasim.compare.intervals import MIN_SCENES
-from foveasim.compare.measure import MEASURES, best_cameras, measure_rows
+from foveasim.compare.measure import best_cameras, metric_rows
+from foveasim.metrics.registry import metric_info
 from foveasim.reconstruct import Picture
 from foveasim.view.web._report_page import (
     FAINT,
@@ -81,7 +82,7 @@ def _summary(comparison: Comparison) -> ReportSection:
             f"Of the field that any camera covers, {'; '.join(missing)}. Pictures are compared in the "
             f"{100.0 * comparison.compared_fraction:.1f} % that all cover."
         )
-    differences = [[head, *others] for head, _, *others in measure_rows(comparison.differences)]
+    differences = [[head, *others] for head, _, *others in metric_rows(comparison.metrics, comparison.differences)]
     interval = "median [95 % confidence interval] over the scenes"
     return ReportSection(
         "Summary",
@@ -90,9 +91,9 @@ def _summary(comparison: Comparison) -> ReportSection:
             ReportTable(("Budget", *comparison.names), budget_rows(comparison.budgets), "Budgets of the cameras."),
             ReportTable(
                 ("Measure", *comparison.names),
-                measure_rows(comparison.summary),
+                metric_rows(comparison.metrics, comparison.summary),
                 f"Over the complete field: {interval}. Bold: the best value of a row.",
-                best_cameras(comparison.summary),
+                best_cameras(comparison.metrics, comparison.summary),
             ),
             ReportTable(
                 ("Difference", *comparison.names[1:]),
@@ -136,10 +137,10 @@ def _eccentricity(comparison: Comparison) -> ReportSection:
     figures = [
         drawn_figure(
             figure_of(partial(draw_measure, comparison, name), INK, FAINT),
-            measure.title,
-            f"{measure.definition[0].upper()}{measure.definition[1:]}{intervals if measure.has_scenes else ''}.",
+            info.title,
+            f"{info.definition[0].upper()}{info.definition[1:]}{intervals if info.has_scene else ''}.",
         )
-        for name, measure in MEASURES.items()
+        for name, info in ((name, metric_info(name)) for name in comparison.metrics)
     ]
     note = f"In annuli around the fixation point ({x_um:g}, {y_um:g}) µm."
     return ReportSection("By eccentricity", (note,), figures=[figures])

@@ -28,7 +28,7 @@ from foveasim.config._objects import (
 )
 from foveasim.config._problems import plain_settings, validate
 from foveasim.config._python import to_python
-from foveasim.config._requirements import RESULTS, RegionResult, Requirement
+from foveasim.config._requirements import RegionResult, Requirement
 from foveasim.config._shots import (
     Result,
     check_directory,
@@ -45,7 +45,6 @@ from foveasim.config._viewing import Viewable, read_viewable
 from foveasim.layout import bundled_layouts
 
 __all__ = [
-    "RESULTS",
     "STARTING_FILES",
     "YAML_EXTENSIONS",
     "LayoutFile",

@@ -4,39 +4,31 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
 
 from foveasim.errors import ParameterError
+from foveasim.metrics.registry import METRICS, check_number_name, has_region, metric_info, options_of
 
-#: Results of photosites by name: label and unit.
-RESULTS: dict[str, tuple[str, str]] = {
-    "snr": ("signal-to-noise ratio", ""),
-    "snr_db": ("signal-to-noise ratio", "dB"),
-    "n_sites": ("photosites", ""),
-    "saturated_fraction": ("saturated photosites", "fraction"),
-    "mean_code_dn": ("mean code", "DN"),
-    "mtf": ("MTF of lens and photosite", ""),
-    "psnr_db": ("PSNR", "dB"),
-    "data_rate_gbit_per_s": ("data rate", "Gbit/s"),
-    "violations": ("violations of design rules", ""),
-    "smallest_size_um": ("smallest photosite", "µm"),
-    "exposure_s": ("exposure", "s"),
-}
-MeasureName = Literal[
-    "snr",
-    "snr_db",
-    "n_sites",
-    "saturated_fraction",
-    "mean_code_dn",
-    "mtf",
-    "psnr_db",
-    "data_rate_gbit_per_s",
-    "violations",
-    "smallest_size_um",
-    "exposure_s",
+
+def _number_names() -> list[str]:
+    return [name for name in METRICS if metric_info(name).is_number]
+
+
+def _check_name(name: str) -> str:
+    """Check the name of a metric in a file; the message is that of a choice."""
+    if name not in _number_names():
+        expected = ", ".join(map(repr, _number_names()))
+        raise PydanticCustomError("literal_error", "must be the name of a metric", {"expected": expected})
+    return name
+
+
+#: Names of metrics that are one number, with those of installed packages.
+MetricName = Annotated[
+    str, AfterValidator(_check_name), Field(json_schema_extra=lambda schema: schema.update(enum=_number_names()))
 ]
-#: Results of a complete sensor, without a region.
-WITHOUT_REGION = ("data_rate_gbit_per_s", "violations", "exposure_s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +39,8 @@ class RegionResult:
     Attributes
     ----------
     measure : str
-        ``"snr"``, the median ratio of signal to temporal noise, and ``"snr_db"`` in dB; ``"n_sites"``;
+        Name of a metric in :data:`foveasim.metrics.METRICS`, own ones included: ``"snr"``, the median ratio of signal to
+        temporal noise, and ``"snr_db"`` in dB; ``"n_sites"``;
         ``"saturated_fraction"``; ``"mean_code_dn"``; ``"mtf"``, of the lens on the axis times the photosite of median area, at
         ``frequency_per_mm``; ``"psnr_db"``, of the reconstructed picture; ``"data_rate_gbit_per_s"`` of one lane;
         ``"violations"`` of the design rules; ``"smallest_size_um"``; ``"exposure_s"``.
@@ -75,22 +68,20 @@ class RegionResult:
     #: Unknown keys of files are errors.
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
-    measure: MeasureName
+    measure: MetricName
     annulus_um: tuple[float, float] | None = None
     rectangle_um: tuple[float, float, float, float] | None = None
     site: int | None = None
     frequency_per_mm: float | None = None
 
     def __post_init__(self) -> None:
-        if self.measure not in RESULTS:
-            raise ParameterError("measure", f"must be one of {', '.join(RESULTS)}", self.measure)
+        check_number_name("measure", self.measure)
         self._check_region()
         if self.frequency_per_mm is not None and not math.isfinite(self.frequency_per_mm):
             raise ParameterError("frequency_per_mm", "must be finite", self.frequency_per_mm)
-        if (self.frequency_per_mm is not None) != (self.measure == "mtf"):
-            raise ParameterError(
-                "frequency_per_mm", "must be given if and only if measure='mtf'", self.frequency_per_mm
-            )
+        if (self.frequency_per_mm is not None) != ("frequency_per_mm" in options_of(METRICS[self.measure])):
+            rule = "must be given if and only if the measure depends on it, as 'mtf' does"
+            raise ParameterError("frequency_per_mm", rule, self.frequency_per_mm)
         if self.frequency_per_mm is not None and self.frequency_per_mm < 0.0:
             raise ParameterError("frequency_per_mm", "must be >= 0", self.frequency_per_mm, "per mm")
 
@@ -99,7 +90,7 @@ class RegionResult:
         regions = [name for name in ("annulus_um", "rectangle_um", "site") if getattr(self, name) is not None]
         if len(regions) > 1:
             raise ParameterError(regions[1], f"excludes {regions[0]}", getattr(self, regions[1]))
-        if regions and self.measure in WITHOUT_REGION:
+        if regions and not has_region(self.measure):
             raise ParameterError(
                 regions[0],
                 f"must not be given: {self.measure} is a result of the complete sensor",
@@ -120,14 +111,19 @@ class RegionResult:
             raise ParameterError("site", "must be the index of a photosite, from 0", self.site)
 
     @property
+    def has_region(self) -> bool:
+        """Whether the result is that of some photosites."""
+        return any(each is not None for each in (self.annulus_um, self.rectangle_um, self.site))
+
+    @property
     def unit(self) -> str:
         """Unit of the result."""
-        return RESULTS[self.measure][1]
+        return metric_info(self.measure).unit
 
     @property
     def subject(self) -> str:
         """The result, in words."""
-        parts = [RESULTS[self.measure][0]]
+        parts = [metric_info(self.measure).title]
         if self.frequency_per_mm is not None:
             parts.append(f"at {self.frequency_per_mm:g} per mm")
         if self.annulus_um is not None:

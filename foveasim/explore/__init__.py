@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from foveasim._core.calls import publish
-from foveasim.explore import metrics  # noqa: F401 -- registers the metrics
-from foveasim.explore._metrics import METRICS, Metric, import_metric
+from foveasim.explore._metrics import import_metric
 from foveasim.explore._schemas import schema_of
 from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.datasets.distributions import parse_distribution
@@ -22,11 +21,9 @@ from foveasim.explore.sweeps.results import open_results
 from foveasim.explore.sweeps.sweep import run_sweep, sweep
 
 __all__ = [
-    "METRICS",
     "CheckedRequirement",
     "Dataset",
     "DatasetFile",
-    "Metric",
     "Plan",
     "ResultMetric",
     "Solution",

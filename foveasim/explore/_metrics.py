@@ -1,4 +1,4 @@
-"""Registry of metrics of a capture, and the lookup of metrics by name or function."""
+"""Lookup of metrics of sweeps and studies by name or function."""
 
 from __future__ import annotations
 
@@ -9,28 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from foveasim._core.names import possible_names
-from foveasim._core.registry import Registry
-from foveasim.camera import Camera
-from foveasim.capture import Capture
-from foveasim.config import Shot
 from foveasim.errors import ParameterError
+from foveasim.metrics.registry import METRICS, Metric, metric_info, options_of
 
-#: A function of a shot, its camera and its capture that returns a number, a mapping of names to numbers, or a labelled array.
-Metric = Callable[[Shot, Camera, Capture], Any]
-
-#: Metrics by name. Installed packages add metrics as entry points of the group ``foveasim.metrics``.
-METRICS: Registry[Metric] = Registry("metric", "foveasim.metrics")
 #: Variables and dimensions of results that are not metrics.
 RESERVED = ("seed", "error", "warning", "point", "repeat")
 #: Hint for functions that are not registered.
 OTHER_METRICS = "pass other functions in Python, or with --metric module:function"
 #: Default metrics of a sweep.
 DEFAULT_METRICS = ("mean_code_dn", "saturated_fraction", "snr", "n_sites")
-
-
-#: Functions that compute the reference of a metric. It depends on the photoelectron rates of an ideal raster, exposure time and
-#: bit depth only, so captures share it.
-REFERENCES: dict[Callable[..., Any], Callable[[Shot, Camera], Any]] = {}
 
 
 def import_metric(name: str) -> Metric:
@@ -84,6 +71,8 @@ def resolve_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | Non
             raise ParameterError("metrics", "must be names of metrics or functions", metric)
         if not isinstance(name, str) or not name.isidentifier():
             raise ParameterError("metrics", "must have names that are identifiers (use a mapping of names)", name)
+        if name in METRICS and metric is METRICS[name] and "frequency_per_mm" in options_of(metric):
+            raise ParameterError("metrics", "must not need a frequency; specify it under 'results'", name)
         if name in RESERVED:
             raise ParameterError("metrics", f"must not have the reserved name '{name}'")
         if name in found:
@@ -113,3 +102,9 @@ def add_metrics(metrics: Mapping[str, Metric], names: Iterable[str]) -> dict[str
 def has_result(metric: str, result: str) -> bool:
     """Return whether a result name is that of a metric, or of an item of its mapping."""
     return result == metric or result.startswith(metric + "_")
+
+
+def reference_of(metric: Metric) -> Callable[..., Any] | None:
+    """Return the function that computes the reference of a registered metric, if it has one."""
+    name = next((name for name, own in METRICS.items() if own is metric), None)
+    return None if name is None else metric_info(name).reference

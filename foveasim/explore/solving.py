@@ -15,6 +15,7 @@ from foveasim.errors import FoveasimError, ParameterError, SimulationError
 from foveasim.explore.requirements import measure
 from foveasim.explore.sweeps.plan import copy_settings, takes_integers
 from foveasim.explore.worker_cache import ShotRunner
+from foveasim.metrics.registry import metric_info
 
 __all__ = ["Solution", "search_value", "solve"]
 
@@ -134,6 +135,7 @@ def search_value(
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise ParameterError("bounds", "must be ascending and finite", bounds)
     target = _Target(requirement)
+    jumps_to_zero = metric_info(requirement.measure).jumps_to_zero
     results: dict[float, float] = {}
     problems: list[str] = []
 
@@ -143,7 +145,7 @@ def search_value(
             try:
                 result = float(result_at(value))
                 # No signal, or saturation: a jump to 0 does not cross a limit, and the largest results are next to it.
-                results[value] = math.nan if result == 0.0 and requirement.measure == "snr" else result
+                results[value] = math.nan if result == 0.0 and jumps_to_zero else result
             except FoveasimError as error:  # such as a generator without sites: the other values may be valid
                 problems.append(str(error))
                 results[value] = math.nan

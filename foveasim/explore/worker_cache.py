@@ -21,8 +21,9 @@ from foveasim._core.validation import Floats
 from foveasim.capture import Capture
 from foveasim.config import Shot, Source, build_shot
 from foveasim.errors import FoveasimError
-from foveasim.explore._metrics import REFERENCES, Metric
+from foveasim.explore._metrics import reference_of
 from foveasim.explore._records import Record, check_unique, to_values
+from foveasim.metrics import Metric
 from foveasim.scene import Scene
 
 __all__ = ["ShotRunner", "WorkerCache", "rate_settings"]
@@ -224,13 +225,13 @@ class ShotRunner:
     def _measure(self, metric: Metric, shot: Shot, capture: Capture, settings: Mapping[str, Any]) -> Any:
         """Compute a metric, with a cached reference where the metric takes one."""
         compared: Callable[..., Any] = metric
-        make = next((make for own, make in REFERENCES.items() if own is metric), None)
+        make = reference_of(metric)
         if make is None:
             return metric(shot, shot.camera, capture)
         # White balance of the reference is in codes.
         key = [make.__name__, rate_settings(shot, settings), shot.exposure_s, shot.camera.sensor.bits]
         reference = self.cache.part("reference", key, lambda: make(shot, shot.camera))
-        return compared(shot, shot.camera, capture, reference)
+        return compared(shot, shot.camera, capture, reference=reference)
 
     def record(self, point: int, settings: Mapping[str, Any]) -> Record:
         """

@@ -7,6 +7,7 @@ Photon transfer, EMVA 1288 parameters, resolution, aliasing, optical flow, and i
 from __future__ import annotations
 
 from foveasim._core.calls import publish
+from foveasim.metrics import shots  # noqa: F401 -- registers the metrics of shots
 from foveasim.metrics.aliasing import AliasingSpectrum, SamplingSpectrum, aliasing_spectrum, sampling_spectrum
 from foveasim.metrics.emva import Emva1288, emva1288
 from foveasim.metrics.emva_intervals import EmvaIntervals
@@ -14,6 +15,7 @@ from foveasim.metrics.flow import FlowBound, FlowEstimate, estimate_flow, flow_b
 from foveasim.metrics.photon_transfer import PhotonTransfer, draw_frames, photon_transfer, predicted_photon_transfer
 from foveasim.metrics.pixel_mtf import polygon_mtf, polygon_otf, wave_vectors_per_mm
 from foveasim.metrics.quality import psnr_db, ssim
+from foveasim.metrics.registry import METRICS, Metric, MetricInfo, metric_info
 from foveasim.metrics.sampling import (
     EccentricityTable,
     neighbour_spacing_um,
@@ -30,6 +32,7 @@ from foveasim.metrics.snr import (
 )
 
 __all__ = [
+    "METRICS",
     "AliasingSpectrum",
     "EccentricityTable",
     "EdgeMtf",
@@ -37,6 +40,8 @@ __all__ = [
     "EmvaIntervals",
     "FlowBound",
     "FlowEstimate",
+    "Metric",
+    "MetricInfo",
     "PhotonTransfer",
     "SamplingSpectrum",
     "SnrTable",
@@ -46,6 +51,7 @@ __all__ = [
     "estimate_flow",
     "flow_bound",
     "measured_snr_by_class",
+    "metric_info",
     "neighbour_spacing_um",
     "nyquist_per_mm",
     "nyquist_vs_eccentricity",

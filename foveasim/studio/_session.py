@@ -20,11 +20,12 @@ from typing import Any
 from foveasim._core.work_arrays import release_memory
 from foveasim._io.atomic import atomic_write
 from foveasim._io.yaml_files import format_yaml
-from foveasim.config import RESULTS, Requirement, check_settings, put_setting, validate
+from foveasim.config import Requirement, check_settings, put_setting, validate
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.explore import measure
 from foveasim.explore.solving import search_value
 from foveasim.layout import Layout
+from foveasim.metrics import metric_info
 from foveasim.studio._costs import FORGET_S, RELEASE_S, REST_S, CancelledError, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
 from foveasim.studio._exports import log_of, text_of, without_directories
@@ -654,7 +655,7 @@ class Session:
             "value": solution.value,
             "result": solution.result,
             "subject": requirement.subject,
-            "measure": RESULTS[requirement.measure][0],
+            "measure": metric_info(requirement.measure).title,
             "result_unit": requirement.unit,
             "limits": [requirement.at_least, requirement.at_most],
             "curve": [list(point) for point in solution.curve],

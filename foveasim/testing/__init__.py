@@ -27,7 +27,7 @@ scene             parameters                                                    
 pupil             parameters                                                     transmitted fraction of the power
 PSF format        as layout formats; returns a PSFGrid
 lens model        parameters                                                     mapping of ideal to real points, µm
-metric            none
+metric            parameters after the capture
 ================  =============================================================  =========================================
 
 Instead of parameters, the example can be a function of an empty directory that writes files and returns the parameters. A

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from foveasim.capture import Capture
-from foveasim.explore import METRICS
+from foveasim.layout import DesignRules
+from foveasim.metrics import METRICS
 from foveasim.scene import Scene
 from foveasim.testing._extension import Extension, check_of, require, shot_with
 
@@ -16,7 +18,7 @@ from foveasim.testing._extension import Extension, check_of, require, shot_with
 @check_of(METRICS)
 def check_metric(extension: Extension) -> None:
     """Check the results of a metric for a capture, and for the same capture in a file."""
-    shot = shot_with("sensor", {"read_noise_e": 3.0})
+    shot = replace(shot_with("sensor", {"read_noise_e": 3.0}), rules=DesignRules(min_size_um=1.0))
     camera = shot.camera
     capture = camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=1)
     assert isinstance(shot.scene, Scene)
@@ -24,7 +26,7 @@ def check_metric(extension: Extension) -> None:
     before = [array.copy() for array in inputs]
 
     def results(of: Capture) -> dict[str, Any]:
-        found = extension.item(shot, camera, of)
+        found = extension.item(shot, camera, of, **extension.example)
         return dict(found) if isinstance(found, Mapping) else {"": found}
 
     found = results(capture)

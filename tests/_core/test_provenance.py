@@ -11,8 +11,8 @@ import sys
 import numpy as np
 import pytest
 
-from foveasim import explore
 from foveasim._core.provenance import identify
+from foveasim.metrics import METRICS
 
 OWN = """
 import functools
@@ -142,7 +142,7 @@ def test_identity_is_constant_during_use():
 
 
 def test_package_metrics_are_identified_by_name():
-    assert identify(explore.METRICS["snr"]) == "foveasim.explore.metrics.snr:snr"
+    assert identify(METRICS["snr"]) == "foveasim.metrics.shots.snr:snr"
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_package_metrics_are_identified_by_name():
     [
         (fraction_above(10), fraction_above(60)),
         (fraction_above(10), fraction_above(10, unit=2.0)),
-        (functools.partial(explore.METRICS["snr"], level=1), functools.partial(explore.METRICS["snr"], level=2)),
+        (functools.partial(METRICS["snr"], level=1), functools.partial(METRICS["snr"], level=2)),
         ("abc".count, "abd".count),
     ],
 )

@@ -21,7 +21,7 @@ from PIL import Image
 from reference.shots import FLAT_SHOT
 from waiting import DEADLINE_S, wait_until
 
-from foveasim import explore
+from foveasim import explore, metrics
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, FileError, SimulationError
 from foveasim.explore import _records
@@ -468,7 +468,7 @@ BAD_STUDIES = [
     ),
     (
         {"metrics": ["own:harsh"]},
-        "bad.yaml: 'metrics' must be names of metrics, got 'own:harsh'; possible: 'data_rate_gbit_per_s'",
+        "bad.yaml: 'metrics' must be names of metrics, got 'own:harsh'; possible: 'alias_fraction'",
     ),
     ({"trials": 0}, "bad.yaml: trials: must be greater than or equal to 1, got 0"),
     ({"trials": "many"}, 'bad.yaml: trials: must be a valid integer, got "many"'),
@@ -891,7 +891,7 @@ def test_cached_reference_changes_no_result():
         shot = build_shot("by hand", plan.settings_of(k))
         capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
         assert found[k].error == ""
-        assert found[k].values["psnr_db"] == explore.METRICS["psnr_db"](shot, shot.camera, capture)
+        assert found[k].values["psnr_db"] == metrics.METRICS["psnr_db"](shot, shot.camera, capture)
 
 
 def test_settings_files_import_no_code(foveasim, folder):

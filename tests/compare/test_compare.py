@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 import foveasim as fs
-from foveasim.compare import MEASURES, quality_by_eccentricity
-from foveasim.compare.measure import best_cameras
+from foveasim.compare import quality_by_eccentricity
+from foveasim.compare.measure import COMPARED, best_cameras
 from foveasim.errors import FileError, ParameterError
+from foveasim.metrics import metric_info
 from foveasim.reconstruct import Picture
 
 OPTIONS = {"n_annuli": 4, "max_pixels": 64}
@@ -51,14 +52,14 @@ def compared(foveal, scenes):
 
 @pytest.mark.slow
 def test_identical_layouts_have_identical_measures(compared):
-    for name in MEASURES:
+    for name in COMPARED:
         for key in (name, f"{name}_by_eccentricity"):
             values = compared.values[key]
             np.testing.assert_array_equal(values[0], values[2])
         median, low, high = compared.differences(name)
         assert median[0] == median[2] == 0.0
         assert low[2] == high[2] == 0.0 or np.isnan([low[2], high[2]]).all()
-    assert any(compared.differences(name).median[1] != 0.0 for name in MEASURES)
+    assert any(compared.differences(name).median[1] != 0.0 for name in COMPARED)
 
 
 @pytest.mark.slow
@@ -284,7 +285,7 @@ def test_report_is_escaped_and_self_contained(compared, tmp_path):
 def test_overview_draws_every_measure(compared):
     axes = compared.plot()
 
-    assert {ax.get_ylabel().split(" / ")[0] for ax in axes} >= {measure.title for measure in MEASURES.values()}
+    assert {ax.get_ylabel().split(" / ")[0] for ax in axes} >= {metric_info(name).title for name in COMPARED}
     axes[0].figure.canvas.draw()
 
 
@@ -388,11 +389,11 @@ def test_best_values_are_marked(compared):
     changed = replace(compared, values=values)
     rows = {line.split("  ")[0]: line for line in str(changed).splitlines()}
 
-    assert best_cameras(changed.summary)[list(MEASURES).index("psnr_db")] == 1
-    assert best_cameras(changed.summary)[list(MEASURES).index("shift_sigma_um")] == 0
+    assert best_cameras(COMPARED, changed.summary)[list(COMPARED).index("psnr_db")] == 1
+    assert best_cameras(COMPARED, changed.summary)[list(COMPARED).index("shift_sigma_um")] == 0
     assert re.search(r" 10 +12 \* +10$", rows["PSNR / dB"])
     values["shift_sigma_um"][2] = 0.1
-    assert best_cameras(changed.summary)[list(MEASURES).index("shift_sigma_um")] is None
+    assert best_cameras(COMPARED, changed.summary)[list(COMPARED).index("shift_sigma_um")] is None
 
 
 @pytest.mark.slow
@@ -401,4 +402,6 @@ def test_report_begins_with_the_verdict(compared, tmp_path):
     page = (tmp_path / "report.html").read_text("utf-8")
 
     assert html.escape(compared.verdict()[0]) in page.split("<table")[0]
-    assert page.count('<strong title="best value">') == sum(best is not None for best in best_cameras(compared.summary))
+    assert page.count('<strong title="best value">') == sum(
+        best is not None for best in best_cameras(COMPARED, compared.summary)
+    )

@@ -10,9 +10,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import foveasim as fs
-from foveasim.compare import MEASURES
+from foveasim.compare.measure import COMPARED
 from foveasim.config import RegionResult, Requirement, Shot
-from foveasim.explore import METRICS
+from foveasim.metrics import METRICS, metric_info
 
 OPTICS = fs.Optics(focal_length_mm=8.0, f_number=2.8)
 LAYOUT = fs.layout.grid(n_x=24, n_y=24, pitch_um=2.0)
@@ -43,8 +43,8 @@ def qualities(dead_fraction, exposure_s):
         {"one": camera, "same": camera}, {"s": scene()}, exposure_s=exposure_s, n_annuli=1, max_pixels=48
     )
     found = {
-        name: (-1.0 if MEASURES[name].is_better_low else 1.0) * float(np.ravel(compared.values[name][0])[0])
-        for name in MEASURES
+        name: (-1.0 if metric_info(name).better == "low" else 1.0) * float(np.ravel(compared.values[name][0])[0])
+        for name in COMPARED
     }
     shot = Shot(name="s", scene=scene(), camera=camera, rules=None, requested_s=exposure_s, seed=0)
     capture = camera.capture(scene(), exposure_s=exposure_s, seed=0)

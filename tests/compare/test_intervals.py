@@ -14,7 +14,7 @@ from foveasim.compare.intervals import format_interval
 from foveasim.errors import ParameterError
 
 N_SCENES, N_SAMPLES = examples(120), 20_000
-MEASURES_OF_SCENES = ("ssim", "shift_sigma_um", "psnr_db", "snr_db", "information_bit_per_site")
+MEASURES_OF_SCENES = ("ssim", "shift_sigma_um", "psnr_db", "snr_mean_db", "information_bit_per_site")
 
 
 def synthetic_photograph(rng, n=64):

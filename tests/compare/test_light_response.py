@@ -77,7 +77,7 @@ def test_effect_and_sensitivity_have_equal_measures(keywords, effects):
         "without": camera(effects=effects, **keywords),
     })  # fmt: skip
 
-    for name in ("information_bit_per_site", "shift_sigma_um", "snr_db"):
+    for name in ("information_bit_per_site", "shift_sigma_um", "snr_mean_db"):
         effect, sensitivity, without = comparison.values[name]
         assert effect == pytest.approx(sensitivity, rel=1e-12)
         assert np.all((effect > without) if name == "shift_sigma_um" else (effect < without))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import foveasim as fs
-from foveasim.compare import MEASURES
 from foveasim.errors import ParameterError
+from foveasim.metrics import metric_info
 
 OPTICS = fs.Optics(focal_length_mm=8.0, f_number=2.8)
 OPTIONS = {"exposure_s": 1 / 60, "n_annuli": 2, "max_pixels": 48}
@@ -79,7 +79,7 @@ def test_comparison_is_independent_of_order(kind):
         columns = [other.scenes.index(name) for name in first.scenes]
         for key, values in first.values.items():
             same = other.values[key][rows]
-            if MEASURES[key.removesuffix("_by_eccentricity")].has_scenes:
+            if metric_info(key.removesuffix("_by_eccentricity")).has_scene:
                 same = same[:, columns]
             np.testing.assert_allclose(same, values, rtol=1e-7, atol=1e-9, err_msg=key)
         np.testing.assert_array_equal(other.coverage_fraction[rows], first.coverage_fraction)

@@ -28,6 +28,7 @@ from foveasim.explore._records import Journal, Record, journal_path, to_values
 from foveasim.explore.executor import CHUNK_S
 from foveasim.explore.sweeps.results import to_dataset, write_store
 from foveasim.explore.worker_cache import ShotRunner
+from foveasim.metrics import METRICS
 
 SHOT = FLAT_SHOT
 #: 120 points with repeats that vary settings of all kinds: layout, lens, electronics, exposure time.
@@ -592,7 +593,7 @@ def test_failed_points_are_reported_and_retried(tmp_path):
         return 7.0
 
     vary = {"exposure_s": [0.1, -1.0, 0.5, 1.0, 2.0]}
-    plan = explore.plan_sweep(SHOT, vary, metrics={"unreliable": unreliable, "n_sites": explore.METRICS["n_sites"]})
+    plan = explore.plan_sweep(SHOT, vary, metrics={"unreliable": unreliable, "n_sites": METRICS["n_sites"]})
 
     found = explore.run_sweep(plan, out=tmp_path / "r.zarr", workers=1)
 
@@ -1011,7 +1012,7 @@ def test_framing_follows_lens_and_layout():
     plan = explore.plan_sweep(
         SHOT | {"scene": scene, "layout": layout},
         vary,
-        metrics={"image_um": image_um, "psnr": explore.METRICS["psnr_db"]},
+        metrics={"image_um": image_um, "psnr": METRICS["psnr_db"]},
     )
     runner = runner_of(plan)
     for k in range(plan.n_points):

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from foveasim import explore
 from foveasim._io.images import write_picture
 from foveasim.config import Source
 from foveasim.config._models import models
 from foveasim.config._objects import put_setting
 from foveasim.explore.worker_cache import ShotRunner, WorkerCache
 from foveasim.layout import Layout
+from foveasim.metrics import METRICS
 from foveasim.optics import PSFGrid
 from foveasim.sensor.effects import EFFECTS, FixedFactor
 
@@ -322,7 +322,7 @@ def runner(tmp_path, monkeypatch):
         return value
 
     monkeypatch.setattr(WorkerCache, "part", logged)
-    metrics = {"checksum": checksum, "psnr": explore.METRICS["psnr_db"], "snr": explore.METRICS["snr"]}
+    metrics = {"checksum": checksum, "psnr": METRICS["psnr_db"], "snr": METRICS["snr"]}
 
     def new():
         return ShotRunner(Source.of(None), metrics, n_threads=1)

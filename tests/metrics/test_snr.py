@@ -10,8 +10,8 @@ import pytest
 
 import foveasim as fs
 from foveasim.errors import ParameterError
-from foveasim.explore import METRICS
 from foveasim.metrics import (
+    METRICS,
     SnrTable,
     measured_snr_by_class,
     relative_exposure_at_snr_fraction,

@@ -144,7 +144,7 @@ def public_objects(directory):
         REQUIREMENT, RESULT, explore.ResultMetric(RESULT), explore.CheckedRequirement(REQUIREMENT, 5.0), explore.Solution("exposure_s", 0.01, 5.0, [(float(k), 1.0) for k in range(50)]),
         config.Viewable(capture, REPORT, "capture"), drc.Case(SITES, fs.DesignRules(min_size_um=1.0)), drc.Measurement(MANY),
         config.Source(file=Path("sweep.yaml"), keys=("shot",), index="3"), layout.SolveFor(name="n_x", is_integer=True, is_increasing=True, guess=len),
-        compare.budget_of(CAMERA, 30.0), compare.MEASURES["psnr_db"], compare.median_interval(np.ones((50, 5))), compare.SceneCovariance(np.ones(50), np.ones(50)),
+        compare.budget_of(CAMERA, 30.0), fs.metrics.metric_info("psnr_db"), compare.median_interval(np.ones((50, 5))), compare.SceneCovariance(np.ones(50), np.ones(50)),
         compare.quality_by_eccentricity(capture.picture(), capture.picture(), edges_um=np.array([0.0, 20.0])),
         compare.cameras({"a": CAMERA, "b": CAMERA}, {"flat": SCENE}, exposure_s=0.01, n_annuli=2),
         reconstruct.ColourCorrection(np.eye(3), np.zeros(24), np.zeros(24)),

@@ -20,7 +20,7 @@ from foveasim._io.yaml_files import read_yaml
 from foveasim.config import Source, put_setting, resolve_files, validate
 from foveasim.config._models import Section
 from foveasim.errors import ParameterError
-from foveasim.explore._metrics import METRICS, OTHER_METRICS, Metric, add_metrics, has_result, resolve_metrics
+from foveasim.explore._metrics import OTHER_METRICS, add_metrics, has_result, resolve_metrics
 from foveasim.explore.sweeps.plan import (
     MAX_POINTS,
     Plan,
@@ -30,6 +30,7 @@ from foveasim.explore.sweeps.plan import (
     takes_integers,
     with_file_context,
 )
+from foveasim.metrics import METRICS, Metric
 
 if TYPE_CHECKING:
     import optuna

@@ -22,12 +22,12 @@ from foveasim._core.names import possible_names
 from foveasim._core.random_streams import derive_seed
 from foveasim._io.atomic import lock
 from foveasim.errors import FileError, FoveasimError, printable
-from foveasim.explore._metrics import Metric
 from foveasim.explore._records import WORKER_LOST, Record, Value, check_same_plan
 from foveasim.explore.executor import KILLED, WORKERS, executor
 from foveasim.explore.studies.plan import Limits, Search, StudyPlan, plan_study
 from foveasim.explore.studies.trials import ERROR, INTERRUPTED, PLAN, completed_trials, with_typed_params
 from foveasim.explore.worker_cache import ShotRunner
+from foveasim.metrics import Metric
 
 if TYPE_CHECKING:
     import optuna

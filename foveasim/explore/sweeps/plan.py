@@ -35,8 +35,9 @@ from foveasim.config import (
 from foveasim.config._models import Section
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._files import digests
-from foveasim.explore._metrics import Metric, add_metrics, resolve_metrics
+from foveasim.explore._metrics import add_metrics, resolve_metrics
 from foveasim.explore.requirements import ResultMetric
+from foveasim.metrics import Metric
 
 __all__ = [
     "MAX_POINTS",

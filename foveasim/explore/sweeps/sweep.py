@@ -13,7 +13,6 @@ import numpy as np
 from foveasim._core.calls import OwnCheck
 from foveasim._core.threads import thread_count
 from foveasim.errors import SimulationError
-from foveasim.explore._metrics import Metric
 from foveasim.explore._records import WORKER_LOST, Journal, Record, check_same_plan, journal_path
 from foveasim.explore.executor import KILLED, WORKERS, executor
 from foveasim.explore.sweeps.plan import Plan, Seed, plan_sweep
@@ -26,6 +25,7 @@ from foveasim.explore.sweeps.results import (
     write_store,
 )
 from foveasim.explore.worker_cache import ShotRunner
+from foveasim.metrics import Metric
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from foveasim.config import RESULTS
-from foveasim.config._requirements import WITHOUT_REGION
 from foveasim.errors import FoveasimError
 from foveasim.explore import CheckedRequirement, measure
+from foveasim.metrics import METRICS, metric_info
+from foveasim.metrics.registry import has_region
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, part
-
-#: Results of which smaller values are better.
-COSTS = ("n_sites", "saturated_fraction", "data_rate_gbit_per_s", "violations", "exposure_s")
 
 
 @part("Requirements", lambda result: (result.capture, result.shot.requirements), order=95)
@@ -31,11 +28,12 @@ def requirements(result: Simulated) -> PartData:
     measures = [
         {
             "name": name,
-            "label": f"{label} / {unit}" if unit else label,
-            "unit": unit,
-            "has_region": name not in WITHOUT_REGION,
-            "is_cost": name in COSTS,
+            "label": f"{info.title} / {info.unit}" if info.unit else info.title,
+            "unit": info.unit,
+            "has_region": has_region(name),
+            "is_cost": info.better == "low",
         }
-        for name, (label, unit) in RESULTS.items()
+        for name, info in ((name, metric_info(name)) for name in METRICS)
+        if info.is_number
     ]
     return {"rows": rows, "measures": measures}, {}

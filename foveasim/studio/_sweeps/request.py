@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from foveasim._core.short_repr import short_repr
-from foveasim.config import RESULTS, RegionResult, validate
+from foveasim.config import RegionResult, validate
 from foveasim.errors import ParameterError
 from foveasim.explore.sweeps.plan import SEED, ValueRange
+from foveasim.metrics import metric_info
 from foveasim.studio._messages import from_json
 from foveasim.studio._settings.changes import check_depth, key_of
 from foveasim.studio._settings.values import number_control
@@ -83,7 +84,7 @@ def about_result(result: RegionResult) -> dict[str, Any]:
     """Return a result as plain data."""
     return {
         "measure": result.measure,
-        "label": RESULTS[result.measure][0],
+        "label": metric_info(result.measure).title,
         "subject": result.subject,
         "unit": result.unit,
     }

@@ -11,9 +11,9 @@ from scipy.special import bdtr
 
 import foveasim as fs
 from foveasim.distortion import LENSES
-from foveasim.explore import METRICS
 from foveasim.layout import DERIVED_LAYERS, FORMATS, RULES, FileFormat, Rule, WrittenLayout, layout_edit, layout_family
 from foveasim.maps import MAP_FORMATS, Found
+from foveasim.metrics import METRICS, MetricInfo
 from foveasim.optics import PSF_FORMATS, PUPILS, PSFGrid
 from foveasim.scene import CUBE_FORMATS, SCENES
 from foveasim.sensor import PIXEL_OPTICS, Footprints, PixelOptics
@@ -254,7 +254,7 @@ class Magnifier:
         return np.asarray(xy_um) / self.factor
 
 
-@METRICS.register("darkest_code_dn")
-def darkest_code_dn(shot, camera, capture):
+@METRICS.register("darkest_code_dn", info=MetricInfo(title="lowest code", unit="DN"))
+def darkest_code_dn(shot, camera, capture, sites=slice(None)):
     """Return the lowest code."""
-    return int(capture.code.min())
+    return int(capture.code[sites].min())

@@ -1,4 +1,4 @@
-"""Metrics of sweeps and studies, registered in :data:`foveasim.explore.METRICS`."""
+"""Metrics of shots, registered in :data:`foveasim.metrics.METRICS`."""
 
 from __future__ import annotations
 
