@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ from foveasim.reconstruct import (
     raster_grid,
     to_cortical,
 )
-from foveasim.reconstruct.picture import Gaps
+from foveasim.reconstruct.picture import PIXELS, Gaps
 from foveasim.sensor import Sensor, signal_to_noise
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ class Capture:
         self,
         method: Method = "cells",
         *,
-        max_pixels: int = 1024,
+        max_pixels: Annotated[int, PIXELS] = 1024,
         grid: Grid | None = None,
         of: Quantity = "code",
         per: Literal["site", "um2"] = "site",
@@ -305,7 +305,7 @@ class Capture:
         r_min_um: float | None = None,
         r_max_um: float | None = None,
         centre_um: tuple[float, float] | None = None,
-        max_pixels: int = 1024,
+        max_pixels: Annotated[int, PIXELS] = 1024,
         sensor: Sensor | None = None,
         n_threads: int | None = None,
     ) -> CorticalImage:

@@ -26,8 +26,13 @@ import errno
 import os
 import re
 import reprlib
+import sys
+import warnings
 from pathlib import Path
+from types import FrameType
 from typing import Any
+
+PACKAGE = __name__.partition(".")[0]
 
 __all__ = [
     "ArgumentError",
@@ -406,3 +411,12 @@ def disk_problem(error: BaseException) -> str:
                 return os.strerror(code)
         cause = cause.__cause__ or cause.__context__
     return ""
+
+
+def warn(message: str, category: type[Warning]) -> None:
+    """Issue a warning at the innermost line outside this package."""
+    frame: FrameType | None = sys._getframe(1)  # noqa: SLF001 -- the only way to count frames
+    level = 2
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == PACKAGE:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(printable(message, keep="\n"), category, stacklevel=level)

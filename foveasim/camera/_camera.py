@@ -22,7 +22,6 @@ from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property, in_order, thread_count
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_per_site, check_point, finite_array, read_only
 from foveasim._core.work_arrays import trim_heaps
 from foveasim.camera._clock import Clock
@@ -42,7 +41,7 @@ from foveasim.camera._warnings import (
 )
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
-from foveasim.errors import FoveasimWarning, ParameterError, type_name
+from foveasim.errors import FoveasimWarning, ParameterError, type_name, warn
 from foveasim.fields import Grid, PowerMap
 from foveasim.incidence import Incidence
 from foveasim.integrate import Integrator, outline_bounds_um
@@ -54,7 +53,7 @@ from foveasim.reconstruct.rasters import sum_of_images
 from foveasim.scene import Scene
 from foveasim.sensor import Footprints, NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import EXPOSURE
-from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET
+from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET, PERCENTILE, TARGET
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
 #: What the optical axis is fixed to when the gaze moves: see :class:`Camera`.
@@ -617,8 +616,8 @@ class Camera:
         self,
         light: Scene | PowerMap,
         *,
-        target: float = AUTO_TARGET,
-        percentile: float = AUTO_PERCENTILE,
+        target: Annotated[float, TARGET] = AUTO_TARGET,
+        percentile: Annotated[float, PERCENTILE] = AUTO_PERCENTILE,
         gaze_um: tuple[float, float] | None = None,
         axis: GazeAxis | None = None,
     ) -> float:

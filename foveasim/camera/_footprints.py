@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foveasim._core.caches import BoundedCache
 from foveasim._core.validation import read_only
 from foveasim.camera._steps import SensorFrame
 from foveasim.camera._warnings import warn_of_small_openings
@@ -30,8 +31,8 @@ class FootprintCache:
     """Recent footprints of a layout, shared by cameras with this layout."""
 
     def __init__(self) -> None:
-        #: Footprints with the objects that their keys identify.
-        self._found: dict[Hashable, tuple[Footprints, PixelOptics, Any]] = {}
+        self._found = BoundedCache(MAX_FOOTPRINTS)
+        self._openings_um = BoundedCache(MAX_FOOTPRINTS)
 
     def get(
         self, pixel_optics: PixelOptics, layout: Layout, optics: Optics, incidence: Incidence, axis_um: Any
@@ -39,13 +40,14 @@ class FootprintCache:
         """Return the footprints of a layout for the cones of a lens."""
         cone = incidence.radius, incidence.exit_pupil_um, incidence.table, incidence.displacement_um, tuple(axis_um)
         key = id(pixel_optics), id(optics.pupil), cone
-        known = self._found.get(key)
-        if known is None:
-            known = check_footprints(pixel_optics, layout, incidence), pixel_optics, optics.pupil
-            self._found[key] = known
-            while len(self._found) > MAX_FOOTPRINTS:
-                self._found.pop(next(iter(self._found)), None)
-        return known[0]
+        owner = pixel_optics, optics.pupil
+        found: Footprints = self._found.get(key, lambda: check_footprints(pixel_optics, layout, incidence), owner=owner)
+        return found
+
+    def opening_um(self, pixel_optics: PixelOptics, layout: Layout) -> float:
+        """Return the narrowest opening of the pixel optics on a layout, in its layer."""
+        compute = partial(pixel_optics.optical_opening_um, layout)
+        return float(self._openings_um.get(id(pixel_optics), compute, owner=pixel_optics))
 
 
 def find_footprints(
@@ -65,8 +67,8 @@ def find_footprints(
     if pixel_optics is None:
         return None
     incidence, axis_um = find_incidence(camera, layout, light, position_um)
-    warn_of_small_openings(pixel_optics, layout, light)
     cache = FootprintCache() if cache is None else cache
+    warn_of_small_openings(cache.opening_um(pixel_optics, layout), light)
     return cache.get(pixel_optics, layout, camera.optics, incidence, axis_um)
 
 

@@ -8,17 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
-from foveasim.errors import CoverageWarning, ExposureWarning, FoveasimWarning, ParameterError, SamplingWarning
+from foveasim.errors import CoverageWarning, ExposureWarning, FoveasimWarning, ParameterError, SamplingWarning, warn
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.optics import Optics
 from foveasim.scene import Scene
-from foveasim.sensor import PixelOptics, Sensor
+from foveasim.sensor import Sensor
 from foveasim.units import um_from_m, um_from_nm
 
 #: Cameras warn when the layout measures less than this fraction of the width of a photograph.
@@ -255,10 +254,9 @@ def warn_of_coarse_cells(optics: Optics, scene: Scene, layout: Layout) -> None:
     )
 
 
-def warn_of_small_openings(pixel_optics: PixelOptics, layout: Layout, light: Scene | PowerMap) -> None:
+def warn_of_small_openings(opening_um: float, light: Scene | PowerMap) -> None:
     """Warn of openings of pixel optics in which rays are diffracted."""
     wavelength_um = float(um_from_nm(light.wavelength_nm.max()))
-    opening_um = pixel_optics.optical_opening_um(layout)
     if opening_um < MIN_OPENING_WAVELENGTHS * wavelength_um:
         warn(
             f"the narrowest opening of the pixel optics measures {opening_um / wavelength_um:.2g} wavelengths in its layer, "

@@ -13,9 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import MAX_SITES, check_count
-from foveasim.errors import FoveasimError, ParameterError
+from foveasim.errors import FoveasimError, ParameterError, warn
 from foveasim.layout.model import Layout
 
 __all__ = ["SITE_TOLERANCE", "SolveFor", "layout_with_n_sites", "select_unknown"]

@@ -11,11 +11,10 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor, nn
 
-from foveasim._core.user_warnings import warn
 from foveasim._io.mapped_files import in_memory
 from foveasim.camera import Camera
 from foveasim.camera._footprints import placed
-from foveasim.errors import ParameterError, SamplingWarning
+from foveasim.errors import ParameterError, SamplingWarning, warn
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator, UndistortedOutlines
 from foveasim.learn._tensors import Constants, Parts, SparseMap, check_tensor, checked_gazes, constant, in_parts

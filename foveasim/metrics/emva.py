@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import OwnCheck
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, finite_array, read_only
-from foveasim.errors import FoveasimWarning, ParameterError, type_name
+from foveasim.errors import FoveasimWarning, ParameterError, type_name, warn
 from foveasim.metrics.emva_intervals import EmvaIntervals, Jackknife
 from foveasim.metrics.photon_transfer import (
     MIN_DARK_DN2,

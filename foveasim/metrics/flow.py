@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import NOT_NEGATIVE, Limits
 from foveasim._core.short_repr import short_repr
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import (
     Bools,
     Floats,
@@ -26,7 +25,7 @@ from foveasim._core.validation import (
     finite_array,
     read_only,
 )
-from foveasim.errors import CoverageWarning, ParameterError
+from foveasim.errors import CoverageWarning, ParameterError, warn
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout

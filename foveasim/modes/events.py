@@ -14,12 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import FINITE, POSITIVE, OwnCheck
 from foveasim._core.extras import import_optional
 from foveasim._core.provenance import to_plain_data
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats, Ints, as_numbers, finite_array, own, read_only
 from foveasim._io.atomic import atomic_write, check_free_space
 from foveasim._io.formats import as_file_error
 from foveasim._io.npz import open_archive, write_archive
-from foveasim.errors import FileError, FoveasimWarning, ParameterError, type_name
+from foveasim.errors import FileError, FoveasimWarning, ParameterError, type_name, warn
 from foveasim.layout import Layout
 from foveasim.layout.packed import OUTLINES, layout_from_arrays, layout_to_arrays
 from foveasim.modes import _hdf5

@@ -27,7 +27,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Floats, Images, Ints
+from foveasim._core.validation import Bools, Floats, Images, Ints
 from foveasim._io.mapped_files import in_memory
 from foveasim.fields import Grid
 from foveasim.optics._aperture import PSFModel
@@ -121,19 +121,11 @@ class Imaging:
     @cached_property
     def groups(self) -> tuple[Group, ...]:
         """Groups of maps, in the order of the first map of each."""
-        from scipy.sparse import csr_array
-        from scipy.sparse.csgraph import connected_components
-
         n_outputs, n_basis = len(self.weights), len(self.irradiance_w_m2)
         is_needed = np.array([[bool(np.any(w * e)) for e in self.irradiance_w_m2] for w in self.weights], bool)
         is_needed = is_needed.reshape(n_outputs, n_basis)  # without maps too
-        edges = np.zeros((n_outputs + n_basis,) * 2, bool)
-        edges[:n_outputs, n_outputs:] = is_needed
-        _, label = connected_components(csr_array(edges), directed=False)
-        of_output, of_basis = label[:n_outputs], label[n_outputs:]
         groups = []
-        for k in dict.fromkeys(of_output.tolist()):
-            outputs, basis = np.flatnonzero(of_output == k), np.flatnonzero(of_basis == k)
+        for outputs, basis in _connected(is_needed):
             if basis.size > outputs.size:
                 steps = [self._step(outputs, np.array([b])) for b in basis]
             elif basis.size:
@@ -279,6 +271,19 @@ class Imaging:
             transform.forward(picture, *on_axis, self.falloff_power, out, (), after)
 
         return self._maps(transform, write_spectrum, lambda weight: transform.factor(*table_of(weight)))
+
+
+def _connected(is_needed: Bools) -> Iterator[tuple[Ints, Ints]]:
+    """Yield the rows and columns of each connected part of a matrix, by its first row."""
+    is_left = np.ones(len(is_needed), bool)
+    while is_left.any():
+        is_in, is_same = np.arange(is_left.size) == is_left.argmax(), False
+        while not is_same:
+            columns = is_needed[is_in].any(axis=0)
+            grown = is_in | is_needed[:, columns].any(axis=1)
+            is_in, is_same = grown, bool((grown == is_in).all())
+        is_left &= ~is_in
+        yield np.flatnonzero(is_in), np.flatnonzero(columns)
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,9 +17,8 @@ from foveasim._core.calls import Limits, OwnCheck, Usual, check_declared
 from foveasim._core.short_repr import short_repr
 from foveasim._core.show import drawn
 from foveasim._core.threads import thread_count
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_number, check_point, finite_array, read_only, wavelengths_nm
-from foveasim.errors import ParameterError, SamplingWarning
+from foveasim.errors import ParameterError, SamplingWarning, warn
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.incidence import N_RINGS, N_RINGS_OF_PUPILS, ChiefRayTable, Incidence, cone_irradiance_sr
 from foveasim.optics._aperture import Aperture, PSFModel, Wavefront, overlaps
@@ -91,6 +91,19 @@ def _is_pupil(pupil: object) -> bool:
     except ValueError:  # builtin without a signature
         return True
     return True
+
+
+class View(NamedTuple):
+    """
+    Image of a scene by a lens.
+
+    Size over that of the scene, grid of its pixels, λN (µm), and automatic oversampling.
+    """
+
+    magnification: float
+    grid: Grid
+    lambda_n_um: Floats
+    auto_oversample: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -390,10 +403,22 @@ class Optics(PointImages):
 
     def grid(self, scene: SceneLike) -> Grid:
         """Return the upright sensor-plane grid of the scene pixels, centred as the scene."""
+        return self._view(scene).grid
+
+    def _view(self, scene: SceneLike) -> View:
+        """Return what follows from the geometry and the wavelengths of a scene."""
+        key = scene.basis.shape[1:], scene.pitch_um, scene.distance_m, scene.centre_um, scene.wavelength_nm.tobytes()
+        found: View = self._cache.views.get(key, lambda: self._make_view(scene))
+        return found
+
+    def _make_view(self, scene: SceneLike) -> View:
         _, n_y, n_x = scene.basis.shape
         magnification = self.magnification(scene.distance_m)
         x_um, y_um = scene.centre_um
-        return Grid.centred((n_y, n_x), _pitch_um(scene) * magnification, (x_um * magnification, y_um * magnification))
+        pitch_um, centre_um = _pitch_um(scene) * magnification, (x_um * magnification, y_um * magnification)
+        grid = Grid.centred((n_y, n_x), pitch_um, centre_um)
+        lambda_n_um = read_only(self.cut_off_um(scene.wavelength_nm, scene.distance_m))
+        return View(magnification, grid, lambda_n_um, self._auto_oversample(scene, grid, lambda_n_um))
 
     def image_grids(self, scene: SceneLike) -> list[tuple[Grid, Bools]]:
         """
@@ -433,8 +458,8 @@ class Optics(PointImages):
         """
         if self.oversample != "auto":
             return self
-        lens = replace(self, oversample=self.auto_oversample(scene))
-        object.__setattr__(lens, "_cache", self._cache)
+        lens = copy(self)  # with the same cache; all other parameters are valid
+        object.__setattr__(lens, "oversample", self.auto_oversample(scene))
         return lens
 
     def auto_oversample(self, scene: SceneLike) -> int:
@@ -454,7 +479,10 @@ class Optics(PointImages):
             if the source pixels are points and farther apart than λN, where finer cells would resolve single emitters. A camera
             warns where :meth:`auto_oversample_error` exceeds 1e-3.
         """
-        per_lambda_n = self._pixels_per_lambda_n(scene)
+        return self._view(scene).auto_oversample
+
+    def _auto_oversample(self, scene: SceneLike, grid: Grid, lambda_n_um: Floats) -> int:
+        per_lambda_n = float(lambda_n_um.min()) / grid.pitch_x_um
         if per_lambda_n < 1.0 and self.source_pixel == "point":
             return 1
         wanted = math.ceil(FINE_CELLS_PER_LAMBDA_N / per_lambda_n * (1.0 - 1e-9))
@@ -463,17 +491,16 @@ class Optics(PointImages):
         wanted = max(1, min(wanted, affordable, MAX_OVERSAMPLE))
         if wanted == 1:
             return 1
-        return max(1, min(wanted, math.isqrt(MAX_AUTO_PADDING_CELLS // max(self._n_padding_pixels(scene), 1))))
+        n_padding = self._n_padding_pixels(scene, grid, lambda_n_um)
+        return max(1, min(wanted, math.isqrt(MAX_AUTO_PADDING_CELLS // max(n_padding, 1))))
 
-    def _n_padding_pixels(self, scene: SceneLike) -> int:
+    def _n_padding_pixels(self, scene: SceneLike, grid: Grid, lambda_n_um: Floats) -> int:
         """Return the number of source pixels that transforms add around a scene, for the blur."""
         from foveasim.optics._transform import source_pixels
 
-        grid, pitch_um = self.grid(scene), self.grid(scene).pitch_x_um
-        lambda_n_um, aperture = self._lambda_n_um(scene), self._aperture(scene.distance_m)
-        pad = self.padding_cells
+        pad, aperture = self.padding_cells, self._aperture(scene.distance_m)
         if pad is None:
-            pixels = Grid.centred(grid.shape, pitch_um, grid.centre_um)
+            pixels = Grid.centred(grid.shape, grid.pitch_x_um, grid.centre_um)
             pad = self._reach_cells(scene, pixels, aperture, lambda_n_um, LOST_FRACTION)
         return math.prod(source_pixels(n, self.padding, pad).size for n in grid.shape) - math.prod(grid.shape)
 
@@ -499,7 +526,8 @@ class Optics(PointImages):
 
     def _pixels_per_lambda_n(self, scene: SceneLike) -> float:
         """Return source pixels per λN at the shortest wavelength."""
-        return float(self._lambda_n_um(scene).min()) / self.grid(scene).pitch_x_um
+        view = self._view(scene)
+        return float(view.lambda_n_um.min()) / view.grid.pitch_x_um
 
     def irradiance_per_radiance(self, distance_m: float) -> float:
         """Return on-axis irradiance over scene radiance (sr), including the transmission."""
@@ -733,7 +761,7 @@ class Optics(PointImages):
         imaging = Imaging(
             basis=scene.basis,
             irradiance_w_m2=irradiance_w_m2
-            * (_pitch_um(scene) * self.magnification(scene.distance_m) / pixels.pitch_x_um) ** 2,
+            * (_pitch_um(scene) * self._view(scene).magnification / pixels.pitch_x_um) ** 2,
             weights=weights,
             field_weights=[] if modes is None else modes.weights(pixels.shape),
             illumination=illumination or [],
@@ -839,7 +867,7 @@ class Optics(PointImages):
 
         grid, aperture = self._refine(self.grid(scene)), self._aperture(scene.distance_m)
         n_modes = None if self.field_modes == "auto" else self.field_modes
-        found: FieldModes = self._cache.modes(
+        found: FieldModes = self._cache.modes.get(
             (scene.wavelength_nm.tobytes(), scene.distance_m, grid),
             lambda: find_modes(
                 aperture,
@@ -889,9 +917,9 @@ class Optics(PointImages):
     def _aperture(self, distance_m: float) -> PSFModel:
         psfs = self.psfs
         if psfs is not None:
-            return self._cache.aperture(distance_m, lambda: FieldPSFs.at(psfs, self.working_f_number(distance_m)))
+            return self._cache.apertures.get(distance_m, lambda: FieldPSFs.at(psfs, self.working_f_number(distance_m)))
         wavefronts: list[Wavefront] = [part for part in (self.zernike, self.seidel) if part is not None]
-        return self._cache.aperture(
+        return self._cache.apertures.get(
             distance_m, lambda: Aperture(self._pupils(), wavefronts, self._defocus_um(distance_m))
         )
 
@@ -902,7 +930,7 @@ class Optics(PointImages):
 
     def _lambda_n_um(self, scene: SceneLike) -> Floats:
         """Return λN at the wavelengths of a scene, or two samples of PSFs if these are coarser."""
-        return self.cut_off_um(scene.wavelength_nm, scene.distance_m)
+        return self._view(scene).lambda_n_um
 
     def cut_off_um(self, wavelength_nm: Floats | float, distance_m: float) -> Floats:
         """Return the period of the cut-off frequency: λN, or two samples of coarser PSFs."""
@@ -963,6 +991,12 @@ class Optics(PointImages):
 
     def _illumination(self, pixels: Grid, aperture: PSFModel, distance_m: float) -> list[FieldWeight] | None:
         """Return relative illumination of pixels; None: the law of the emission; empty: uniform."""
+        found: list[FieldWeight] | None = self._cache.illumination.get(
+            (pixels, distance_m), lambda: self._make_illumination(pixels, aperture, distance_m)
+        )
+        return found
+
+    def _make_illumination(self, pixels: Grid, aperture: PSFModel, distance_m: float) -> list[FieldWeight] | None:
         from foveasim.optics._field_modes import field_points_um, field_weights
 
         points_um = field_points_um(pixels, ILLUMINATION_POINTS)

@@ -39,10 +39,12 @@ MAX_INDEX = 5151
 MAX_ORDER = 100
 #: Largest wavefront error, µm or waves: 10 cm is beyond any lens.
 MAX_PATH = 1e5
+#: Indices of both schemes.
+NOLL, OSA = Limits(at_least=1, at_most=MAX_INDEX), Limits(at_least=0, at_most=MAX_INDEX)
 PATH = Limits(at_least=-MAX_PATH, at_most=MAX_PATH)
 
 
-def noll_to_nm(j: Annotated[int, Limits(at_least=1, at_most=MAX_INDEX)]) -> tuple[int, int]:
+def noll_to_nm(j: Annotated[int, NOLL]) -> tuple[int, int]:
     """
     Convert a Noll index to the orders (n, m) of a Zernike polynomial.
 
@@ -63,7 +65,7 @@ def noll_to_nm(j: Annotated[int, Limits(at_least=1, at_most=MAX_INDEX)]) -> tupl
     return n, m if j % 2 == 0 else -m
 
 
-def osa_to_nm(j: Annotated[int, Limits(at_least=0, at_most=MAX_INDEX)]) -> tuple[int, int]:
+def osa_to_nm(j: Annotated[int, OSA]) -> tuple[int, int]:
     """
     Convert an OSA/ANSI index to the orders (n, m) of a Zernike polynomial.
 
@@ -193,9 +195,12 @@ class Zernike:
     def __reduce__(self) -> tuple[Any, ...]:
         return _zernike, (dict(self.coefficients), self.index, self.unit, self.wavelength_nm)
 
-    def _orders(self, j: int) -> tuple[int, int]:
+    def _orders(self, j: Any) -> tuple[int, int]:
         try:
-            return noll_to_nm(j) if self.index == "noll" else osa_to_nm(j)
+            limits, orders_of = (NOLL, noll_to_nm) if self.index == "noll" else (OSA, osa_to_nm)
+            if isinstance(j, str):
+                raise ParameterError("coefficients", "must be an integer", j)
+            return orders_of(limits.check_count("coefficients", j))
         except ParameterError as error:
             raise ParameterError("coefficients", f"has an index that {error.detail}") from None
 

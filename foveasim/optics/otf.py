@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.caches import BoundedCache
 from foveasim._core.threads import ForkSafeLock, cached_property, parallel_map
 from foveasim._core.validation import Floats, as_numbers
 from foveasim.optics._aperture import PSFModel
@@ -30,6 +31,8 @@ POINTS_TOGETHER = 32
 SUMS_TOGETHER = 16
 #: Largest number of cached apertures, and of modes over the field, one per scene distance.
 MAX_CACHED_APERTURES = 4
+#: Largest number of cached geometries of scenes.
+MAX_CACHED_VIEWS = 16
 #: Memory limit of the tables of all wavelengths, in numbers (128 MiB); beyond it, their step increases.
 MAX_TABLE_SIZE = 1 << 24
 #: Memory limit of the tables cached per lens, in complex numbers (512 MiB in single precision).
@@ -235,32 +238,15 @@ class TableCache:
     def __init__(self) -> None:
         self._lock = ForkSafeLock()
         self._tables: dict[tuple[Hashable, Hashable], PlaneTables] = {}
-        self._modes: dict[Hashable, Any] = {}
-        self._apertures: dict[float, PSFModel] = {}
         self._factors: dict[tuple[Hashable, bytes], NDArray[Any] | None] = {}
+        #: Apertures, modes and relative illumination of the field, and images of scenes by their geometry.
+        self.apertures = BoundedCache(MAX_CACHED_APERTURES)
+        self.modes = BoundedCache(MAX_CACHED_APERTURES)
+        self.illumination = BoundedCache(MAX_CACHED_APERTURES)
+        self.views = BoundedCache(MAX_CACHED_VIEWS)
 
     def __reduce__(self) -> tuple[type[TableCache], tuple[()]]:
         return TableCache, ()
-
-    def aperture(self, distance_m: float, create: Callable[[], PSFModel]) -> PSFModel:
-        """Return the aperture for a scene distance; the most recently used ones are cached."""
-        with self._lock:
-            aperture = self._apertures.pop(distance_m) if distance_m in self._apertures else create()
-            self._apertures[distance_m] = aperture
-            while len(self._apertures) > MAX_CACHED_APERTURES:
-                del self._apertures[next(iter(self._apertures))]
-            return aperture
-
-    def modes(self, key: Hashable, create: Callable[[], Any]) -> Any:
-        """Return the modes of a field; the most recently used ones are cached."""
-        with self._lock:
-            found = self._modes.pop(key, None)
-        found = create() if found is None else found
-        with self._lock:
-            self._modes[key] = found
-            while len(self._modes) > MAX_CACHED_APERTURES:
-                del self._modes[next(iter(self._modes))]
-        return found
 
     def prepare(
         self,

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Picture", "raster_grid"]
 
+#: Pixels along the longer side of a picture.
+PIXELS = Limits(at_least=1, at_most=2**15)
 #: Coverage below this fraction, and lack of coverage below that one, are rounding errors.
 NO_COVERAGE, COMPLETE = 1e-9, 1e-6
 #: Layouts with cached parts, up to 200 bytes per site: the number of them with up to a number of sites.
@@ -295,7 +297,7 @@ def _channels(colour: Colour, n_channels: int) -> Floats:
     return np.array(rgb[:1] if is_grey else rgb, np.float64).reshape(-1, 1, 1) / 255.0
 
 
-def raster_grid(layout: PackedRings, max_pixels: Annotated[int, Limits(at_least=1, at_most=2**15)]) -> Grid:
+def raster_grid(layout: PackedRings, max_pixels: Annotated[int, PIXELS]) -> Grid:
     """
     Return a grid of square pixels over the layout, ``max_pixels`` along its longer side.
 

@@ -400,7 +400,7 @@ class Sensor:
 
     # -- filters and quantum efficiency -------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def _filter_set(self) -> FilterSet:
         if self.filters is None:
             return FilterSet((ConstantCurve(1.0),), ("all",))

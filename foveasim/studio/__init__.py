@@ -21,9 +21,8 @@ from typing import Annotated
 
 from foveasim._core.calls import PORT, publish
 from foveasim._core.extras import import_optional
-from foveasim._core.user_warnings import warn
 from foveasim.config import check_directory
-from foveasim.errors import FileError, FoveasimWarning, ParameterError
+from foveasim.errors import FileError, FoveasimWarning, ParameterError, warn
 
 __all__ = ["run_studio"]
 

@@ -17,11 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FINITE, POSITIVE, Limits, check_declared
 from foveasim._core.threads import parallel_map, thread_count
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats, check_count, check_shape, finite_array
 from foveasim._io.images import write_picture
 from foveasim.capture import Capture
-from foveasim.errors import FoveasimWarning, GeometryError, ParameterError, SimulationError
+from foveasim.errors import FoveasimWarning, GeometryError, ParameterError, SimulationError, warn
 from foveasim.layout import Layout
 from foveasim.view._annotations import Label, add_strip, strip_width_px
 from foveasim.view._ipython import display, is_notebook

@@ -35,11 +35,10 @@ from foveasim._core.calls import LENGTH, Declared, Limits
 from foveasim._core.extras import import_optional
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.short_repr import short_repr
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
-from foveasim.errors import FileError, GeometryError, LayoutWarning, ParameterError
+from foveasim.errors import FileError, GeometryError, LayoutWarning, ParameterError, warn
 from foveasim.layout import Layout, inset, node
 from foveasim.layout._regions import as_region
 from foveasim.layout.adjacency import colours_of_boxes

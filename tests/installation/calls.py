@@ -549,6 +549,7 @@ CALLS = {
         fs.Grid.centred((60, 60), 0.5),
         variance_e2=1.0,
     ),
+    "metrics.metric_info": lambda o: metrics.metric_info("snr_db").title,
     "metrics.flow_bound": lambda o: metrics.flow_bound(np.random.default_rng(0).normal(size=(64, 2)), 1.0),
     "metrics.measured_snr_by_class": lambda o: metrics.measured_snr_by_class(o.layout, o.frames, o.dark, bits=8),
     "metrics.neighbour_spacing_um": lambda o: metrics.neighbour_spacing_um(o.plain),

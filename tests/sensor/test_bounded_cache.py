@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from waiting import wait_until
 
-from foveasim.sensor.bounded_cache import BoundedCache
+from foveasim._core.caches import BoundedCache
 
 
 def test_value_is_computed_once():

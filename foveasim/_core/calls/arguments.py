@@ -34,6 +34,9 @@ BOUND = ("self", "cls")
 _Kinds = tuple[list[tuple[str, Kind | None]], dict[str, Kind | None], tuple[str, Kind] | None, Kind | None]
 #: Converters of parameters with declared limits, by position and by name.
 _Converters = tuple[list[tuple[int, str, Converter]], dict[str, Converter]]
+#: Modules whose functions check their arguments only in calls from outside the package: within it, they are called many times
+#: per capture, with what was checked where the call of a user enters.
+INNER = ("foveasim.optics._optics", "foveasim.sensor.effects.contract", "foveasim.units")
 #: Attribute of checked functions.
 CHECKED = "_arguments_are_checked"
 
@@ -44,12 +47,13 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
 
     ``converts``: whether arguments with declared limits are checked and converted, to floats and integers; dataclasses do
     so themselves. A valid call takes 1 to 2 µs longer, and lists of numbers a time in proportion to their length; the
-    annotations are read at the first call.
+    annotations are read at the first call. Those of :data:`INNER` modules are not checked within the package.
     """
     if not isinstance(call, FunctionType) or hasattr(call, CHECKED):
         return call
     # Not globals of the function below.
     find_problem, find_checks, check = _find_problem, _find_checks, check_kind
+    frame, is_inner = sys._getframe, call.__module__ in INNER and call.__name__ != "__init__"  # noqa: SLF001 -- as in logging
     kinds: _Kinds | None = None
     converters: _Converters = [], {}
     annotations = call.__annotations__
@@ -57,6 +61,8 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
         __tracebackhide__ = True  # in the tracebacks of IPython and pytest
         nonlocal kinds, converters
+        if is_inner and frame(1).f_globals.get("__name__", "").startswith("foveasim."):
+            return call(*args, **kwargs)
         if kinds is None:
             found, found_converters = find_checks(call, annotations)
             converters = found_converters if converts else converters

@@ -21,7 +21,6 @@ from foveasim._core.calls import Limits, OwnCheck
 from foveasim._core.provenance import versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.threads import cached_property
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Ints, check_choice, check_count
 from foveasim.capture import Capture
 from foveasim.config import Shot, Source, build_shot, check_settings, put_setting, resolve_files
@@ -33,6 +32,7 @@ from foveasim.errors import (
     ParameterError,
     SimulationError,
     type_name,
+    warn,
 )
 from foveasim.explore._files import digests
 from foveasim.explore.datasets.distributions import MAX_INTEGER, MIN_INTEGER, Distribution, parse_distribution

@@ -23,10 +23,9 @@ from foveasim._core.calls import Limits
 from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim._core.threads import thread_count
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Ints
 from foveasim._io.atomic import atomic_directory, atomic_write
-from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError, warn
 from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.datasets.items import flatten, unflatten
 from foveasim.explore.datasets.zarr_rows import RowReader, create_rows

@@ -43,12 +43,11 @@ from numpy.typing import NDArray
 from foveasim._core.extras import import_optional
 from foveasim._core.names import CHANNEL_LETTERS
 from foveasim._core.rings import SITE_ID, positions_in_runs, site_ids
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import MAX_SITES, Floats, Ints
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
 from foveasim._io.sandbox import WALL_TIME_FACTOR, run_in_sandbox
-from foveasim.errors import FileError, GeometryError, LayoutWarning, ParameterError
+from foveasim.errors import FileError, GeometryError, LayoutWarning, ParameterError, warn
 from foveasim.layout.database_grid import DEFAULT_DBU_UM, has_valid_outlines, on_grid, to_um
 from foveasim.layout.files import _gdstk
 from foveasim.layout.files._columns import (

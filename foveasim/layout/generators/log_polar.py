@@ -10,9 +10,8 @@ import numpy as np
 
 from foveasim._core.calls import LENGTH, Limits
 from foveasim._core.rings import ring_area_um2
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_count, check_length_um, check_sites
-from foveasim.errors import LayoutWarning, ParameterError
+from foveasim.errors import LayoutWarning, ParameterError, warn
 from foveasim.layout.families import layout_family
 from foveasim.layout.generators._annuli import CHORDS, MIN_SITES_PER_RHO, Annuli, Fovea, Ring, annuli, fovea_rings
 from foveasim.layout.generators.tiling import with_hexagons

@@ -10,9 +10,8 @@ import numpy as np
 import shapely
 
 from foveasim._core.calls import LENGTH
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats, check_point, check_sites
-from foveasim.errors import GeometryError, LayoutWarning, ParameterError
+from foveasim.errors import GeometryError, LayoutWarning, ParameterError, warn
 from foveasim.layout._regions import as_region, parse_region
 from foveasim.layout.drc.measurements import is_below_size
 from foveasim.layout.edits.all_sites import clip, merge_small, union

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.threads import cached_property
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats
-from foveasim.errors import ParameterError, SamplingWarning
+from foveasim.errors import ParameterError, SamplingWarning, warn
 from foveasim.optics._aperture import ACROSS_PER_BLUR, MAX_ACROSS, MIN_ACROSS, check_reach
 from foveasim.units import um_from_nm
 

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import LENGTH
 from foveasim._core.threads import cached_property
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import (
     Floats,
     Ints,
@@ -22,7 +21,7 @@ from foveasim._core.validation import (
     read_only,
     wavelengths_nm,
 )
-from foveasim.errors import ParameterError, SamplingWarning
+from foveasim.errors import ParameterError, SamplingWarning, warn
 
 #: Largest number of values: 2 GiB in double precision.
 MAX_VALUES = 1 << 28

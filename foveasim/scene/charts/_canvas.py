@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.calls import FRACTION, Limits, check_arguments, check_declared, without_declarations
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Bools, Floats, check_shape, freeze
-from foveasim.errors import ParameterError, SamplingWarning
+from foveasim.errors import ParameterError, SamplingWarning, warn
 from foveasim.scene._photometry import level_of_white
 from foveasim.scene._scene import DISTANCE, PITCH, RADIANCE, Scene, scene_bands
 from foveasim.scene.registry import SCENES

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from foveasim._core.user_warnings import warn
 from foveasim._core.validation import Floats, band_widths_nm, check_number, finite_array, wavelengths_nm
 from foveasim._io.formats import FormatError
 from foveasim._io.mapped_files import value_range
 from foveasim._io.rasters.units import Powers, parse_unit, round_factor
-from foveasim.errors import FoveasimWarning, ParameterError
+from foveasim.errors import FoveasimWarning, ParameterError, warn
 from foveasim.scene._illuminants import TABLES_NM, Illuminant
 from foveasim.scene._illuminants import illuminant as cie_illuminant
 from foveasim.scene._photometry import level_of_white, the_only

@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.caches import BoundedCache
 from foveasim._core.random_streams import random_key
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, read_only
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.fields import PackedRings
-from foveasim.sensor.bounded_cache import BoundedCache
 from foveasim.sensor.device import Device
 
 if TYPE_CHECKING:
