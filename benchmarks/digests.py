@@ -79,17 +79,24 @@ def settings_of_shots() -> Iterator[tuple[str, Path | None, dict[str, Any]]]:
     for name in fs.layout.bundled_layouts():
         settings = fs.config.read_settings(demo)
         settings.pop("requirements", None)
-        yield f"layout {name}", demo, {**settings, "layout": name, "exposure_s": "auto", "sensor": {"preset": "machine_vision"}}
+        yield (
+            f"layout {name}",
+            demo,
+            {**settings, "layout": name, "exposure_s": "auto", "sensor": {"preset": "machine_vision"}},
+        )
     for name in EFFECTS:
         example = EFFECTS.example(name)
         if isinstance(example, Mapping):
             yield f"effect {name}", None, {**SMALL, "sensor": {"capacitance_f": 4e-15, **example}}
-    for optics in ({"seidel": {"coma_um": 0.4, "field_radius_um": 150.0}}, {"pupil": {"kind": "spider", "n_vanes": 3, "width_fraction": 0.1}}):
+    for optics in (
+        {"seidel": {"coma_um": 0.4, "field_radius_um": 150.0}},
+        {"pupil": {"kind": "spider", "n_vanes": 3, "width_fraction": 0.1}},
+    ):
         yield f"optics {next(iter(optics))}", None, {**SMALL, "optics": {**SMALL["optics"], **optics}}
     yield "gaze", None, {**SMALL, "gaze_um": [20.0, -10.0]}
 
 
-def of_shot(name: str, file: Path | None, settings: dict[str, Any], directory: Path) -> dict[str, Any]:
+def of_shot(file: Path | None, settings: dict[str, Any], directory: Path) -> dict[str, Any]:
     """Return the results of a shot by name."""
     shot = fs.config.build_shot(file, settings)
     result, paths = fs.config.run_shot(shot, directory)
@@ -98,7 +105,9 @@ def of_shot(name: str, file: Path | None, settings: dict[str, Any], directory: P
     found: dict[str, Any] = {
         "capture": {key: getattr(capture, key) for key in ("code", "electrons", "expected_e")},
         "settings": json.dumps(capture.settings, sort_keys=True, default=str),
-        "prediction": {key: np.asarray(getattr(predicted, key)) for key in ("mean_dn", "variance_dn2") if hasattr(predicted, key)},
+        "prediction": {
+            key: np.asarray(getattr(predicted, key)) for key in ("mean_dn", "variance_dn2") if hasattr(predicted, key)
+        },
         "picture": capture.picture(max_pixels=64).data,
         "rules": "" if result.report is None else str(result.report),
         "summary": str(capture.layout.describe()),
@@ -117,13 +126,15 @@ def of_shot(name: str, file: Path | None, settings: dict[str, Any], directory: P
 
 def of_jobs(directory: Path) -> dict[str, Any]:
     """Return the results of a sweep, a comparison, a video and schemas."""
-    names = [name for name in ("n_sites", "mean_code_dn", "saturated_fraction", "snr", "psnr_db", "data_rate_gbit_per_s")]
+    names = ["n_sites", "mean_code_dn", "saturated_fraction", "snr", "psnr_db", "data_rate_gbit_per_s"]
     swept = fs.explore.sweep(SMALL, {"exposure_s": [0.002, 0.02]}, metrics=names, workers=0)
     shot = fs.config.build_shot(None, SMALL)
     optics = shot.camera.optics
     layouts = {"grid": fs.layout.grid(20, 20, 6.0), "rings": shot.camera.layout}
     cameras = {key: fs.Camera(optics=optics, sensor=fs.compare.default_sensor(each)) for key, each in layouts.items()}
-    compared = fs.compare.cameras(cameras, {"star": shot.scene}, exposure_s=0.01, n_annuli=2, max_pixels=48, budget=None)
+    compared = fs.compare.cameras(
+        cameras, {"star": shot.scene}, exposure_s=0.01, n_annuli=2, max_pixels=48, budget=None
+    )
     compared.write(directory / "report.html")
     frames = list(shot.camera.video([shot.scene] * 3, frame_s=0.02, exposure_s=0.01, seed=1))
     found = {
@@ -153,7 +164,7 @@ def main() -> int:
     for name, file, settings in settings_of_shots():
         with tempfile.TemporaryDirectory() as directory:
             try:
-                results = of_shot(name, file, settings, Path(directory))
+                results = of_shot(file, settings, Path(directory))
                 found |= {f"{name}: {key}": digest(value) for key, value in results.items()}
             except fs.FoveasimError as error:
                 found[f"{name}: error"] = str(error)

@@ -37,6 +37,7 @@ from learning import bench_learning, bench_stored
 from looking import bench_looking
 from report import Report, best_s
 from rich.console import Console
+from small import bench_small
 from video import bench_video
 
 import foveasim as fs
@@ -448,6 +449,7 @@ def benchmarks(*, is_quick: bool) -> list[tuple[Callable[..., object], tuple[obj
         (bench_field_modes, (side,)),
         (bench_kernels, (side,)),
         (bench_sensor, (n_side,)),
+        (bench_small, ()),
         (bench_layouts, (10_000 if is_quick else 1_000_000,)),
         (bench_video, (n_side,)),
         (bench_learning, (n_side,)),

@@ -215,7 +215,10 @@ class Camera:
     def oversample(self, light: Scene | PowerMap) -> int:
         """Return the number of map cells along a source pixel; 1 for power maps."""
         light = self._with_pitch(light)
-        return 1 if isinstance(light, PowerMap) else int(self._optics.resolve_oversample(light).oversample)
+        if isinstance(light, PowerMap):
+            return 1
+        n = self._optics.oversample
+        return self._optics.auto_oversample(light) if n == "auto" else n
 
     def order(self, light: Scene | PowerMap) -> Literal[1, 2]:
         """Return the order of integration for a scene or power map."""
