@@ -24,7 +24,7 @@ from foveasim._io.npz import open_archive, write_archive
 from foveasim._io.zarr_stores import ZARR, Variable, free_name, open_store, store_format, write_variables
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
-from foveasim.layout import Layout
+from foveasim.layout.model import Layout
 from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 from foveasim.reconstruct import (
     ColourCorrection,

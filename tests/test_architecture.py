@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -25,26 +26,26 @@ from foveasim._core.validation import UNIT_SUFFIXES
 PACKAGE = Path(foveasim.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-#: Subpackages and modules by layer, from the bottom: imports from lower layers only.
-LAYERS = [
-    {"errors", "_version"},
-    {"_core"},
-    {"units"},
-    {"_io"},
-    {"fields", "incidence"},
-    {"distortion", "integrate", "layout", "maps", "optics", "scene", "sensor"},
-    {"modes", "reconstruct"},
-    {"capture"},
-    {"camera"},
-    {"tiles", "video", "view"},
-    {"metrics"},
-    {"compare"},
-    {"config"},
-    {"explore", "learn"},
-    {"studio", "testing"},
-    {"cli"},
-    {"__main__"},
-]
+#: Six floors, each of which imports from those below, and the layers of each, from the bottom: imports from lower layers only.
+#: Modules of a package that are not on its floor have an entry of their own.
+FLOORS = {
+    "ground": [{"errors", "_version"}, {"_core"}, {"units"}, {"_io"}, {"fields", "incidence"}, {"maps"}],
+    "physics": [
+        {
+            "distortion", "integrate", "optics", "scene", "sensor", "layout._kernels", "layout.lattice", "layout.model",
+            "layout.adjacency", "layout.gaps", "layout.graph", "layout.packed",
+        },
+        {"modes", "reconstruct"},
+        {"capture"},
+        {"camera"},
+    ],
+    "design": [{"layout"}],
+    "show": [{"view"}],
+    "lab": [{"tiles", "video"}, {"metrics"}, {"compare"}, {"config"}, {"explore", "learn"}],
+    "studio": [{"studio", "testing"}, {"cli"}, {"__main__"}],
+}  # fmt: skip
+LAYERS = [layer for layers in FLOORS.values() for layer in layers]
+LAYER_OF = {name: k for k, names in enumerate(LAYERS) for name in names}
 #: Packages that are imported on first use.
 HEAVY = {
     "OpenEXR", "PIL", "astropy", "av", "cv2", "dask", "distributed", "exactextract", "gdstk", "h5netcdf", "h5py", "imagecodecs", "klayout", "manifold3d", "matplotlib", "pyarrow", "numba", "optuna", "pydantic", "pyvista", "rich", "skimage", "starlette", "tifffile",
@@ -111,32 +112,72 @@ def test_package_lists_public_names_only():
     assert set(dir(foveasim)) == set(foveasim.__all__)
 
 
-def imported_subpackages(path):
-    subpackages = set()
-    for node in nodes_of(path):
-        names = []
-        if isinstance(node, ast.ImportFrom) and node.module:
-            names = [node.module, *(f"{node.module}.{a.name}" for a in node.names if node.module == "foveasim")]
-        elif isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        subpackages |= {name.split(".")[1] for name in names if name.startswith("foveasim.")}
-    return {name for name in subpackages if not name.startswith("__")}
+def place_of(module):
+    """Return the longest entry of a layer that contains a module, such as ``layout.model`` or ``optics``."""
+    parts = module.split(".")
+    return next(place for n in (2, 1) if (place := ".".join(parts[:n])) in LAYER_OF)
+
+
+def imports_of(tree):
+    """Yield the modules and names of the package that a module imports, those for annotations alone excepted."""
+    if isinstance(tree, ast.If) and getattr(tree.test, "id", None) == "TYPE_CHECKING":
+        return
+    if isinstance(tree, ast.ImportFrom) and str(tree.module).startswith("foveasim"):
+        names = [f"{tree.module}.{alias.name}" for alias in tree.names]
+        # A name may be a module, or an object of the module it is imported from.
+        yield from (name if find_module(name) else tree.module for name in names)
+    elif isinstance(tree, ast.Import):
+        yield from (alias.name for alias in tree.names if alias.name.startswith("foveasim."))
+    for child in ast.iter_child_nodes(tree):
+        yield from imports_of(child)
+
+
+@cache
+def find_module(name):
+    path = PACKAGE.joinpath(*name.split(".")[1:])
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+
+
+def upward_imports(module, tree):
+    """Return what a module imports from the same or a higher layer, besides its own package."""
+    place = place_of(module)
+    found = {name.removeprefix("foveasim.") for name in imports_of(tree) if not name.startswith("foveasim.__")}
+    others = {place_of(name) for name in found - {"foveasim"}}
+    return {
+        other
+        for other in others
+        if (LAYER_OF[other] >= LAYER_OF[place] and other.split(".")[0] != place.split(".")[0])
+        or LAYER_OF[other] > LAYER_OF[place]
+    }
 
 
 def test_every_subpackage_has_a_layer():
     subpackages = {subpackage_of(path) for path in MODULES} - {"__init__"}
 
-    assert subpackages == set().union(*LAYERS)
+    assert subpackages == {name for name in LAYER_OF if "." not in name}
+    assert all(find_module(f"foveasim.{name}") for name in LAYER_OF)
 
 
 def test_imports_go_one_way():
-    layer_of = {name: k for k, names in enumerate(LAYERS) for name in names}
-
     def upwards(path):
-        name = subpackage_of(path)
-        return {other for other in imported_subpackages(path) - {name} if layer_of[other] >= layer_of[name]}
+        return upward_imports(module_name(path).removeprefix("foveasim."), parsed(path))
 
     assert offenders(upwards, [path for path in MODULES if path != PACKAGE / "__init__.py"]) == {}
+
+
+@pytest.mark.parametrize(
+    ("module", "code", "found"),
+    [
+        ("sensor.adc", "from foveasim.camera import Camera", {"camera"}),
+        ("layout.model", "def f():\n    from foveasim.layout.drc.rules import check", {"layout"}),
+        ("camera._camera", "from foveasim.layout import Layout", {"layout"}),
+        ("layout.drc.rules", "from foveasim.layout.model import Layout", set()),
+        ("metrics.snr", "from foveasim import view, explore", {"explore"}),
+        ("scene._scene", "if TYPE_CHECKING:\n    from foveasim.view import plot_scene", set()),
+    ],
+)
+def test_planted_imports_are_found(module, code, found):
+    assert upward_imports(module, ast.parse(code)) == found
 
 
 def imported_modules(path, names):

@@ -1,4 +1,4 @@
-"""Methods that draw: functions of :mod:`foveasim.view`, which is imported on use."""
+"""Methods that are functions of higher floors, such as those that draw: imported by name, on use."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ R = TypeVar("R")
 #: First parameter of a numpydoc section, with its description.
 FIRST_PARAMETER = re.compile(r"(\n *Parameters\n *-+\n)( *)\S.*\n(?:\2 +.*\n|\n(?=\2 ))*")
 NO_PARAMETERS = re.compile(r"\n *Parameters\n *-+\n(?=\s*(\n *\w+\n *-+\n|$))")
+
+
+def load(module: str) -> Any:
+    """Return a module of a higher floor by its name, when a method of a lower one needs it."""
+    return import_module(f"foveasim.{module}")
 
 
 class _OfFunction:
@@ -66,7 +71,7 @@ class Drawn(Generic[R]):
     @property
     def function(self) -> Callable[..., R]:
         """The function that draws."""
-        found: Callable[..., R] = getattr(import_module("foveasim.view"), self._name)
+        found: Callable[..., R] = getattr(load("view"), self._name)
         return found
 
     @overload

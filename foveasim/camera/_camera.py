@@ -45,7 +45,7 @@ from foveasim.errors import FoveasimWarning, ParameterError, type_name, warn
 from foveasim.fields import Grid, PowerMap
 from foveasim.incidence import Incidence
 from foveasim.integrate import Integrator, outline_bounds_um
-from foveasim.layout import Layout
+from foveasim.layout.model import Layout
 from foveasim.modes import Between, Exposure, Shutter
 from foveasim.optics import Optics
 from foveasim.reconstruct import Picture, reference

@@ -13,8 +13,7 @@ from foveasim.camera._steps import SensorFrame
 from foveasim.camera._warnings import warn_of_small_openings
 from foveasim.fields import PackedRings, PowerMap
 from foveasim.incidence import Incidence
-from foveasim.layout import Layout
-from foveasim.layout.model import layout_of
+from foveasim.layout.model import Layout, layout_of
 from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.sensor.pixel_optics.contract import Footprints, PixelOptics, check_footprints

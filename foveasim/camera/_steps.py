@@ -20,7 +20,7 @@ from foveasim.distortion import Lens
 from foveasim.errors import SimulationError
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
-from foveasim.layout import Layout
+from foveasim.layout.model import Layout
 from foveasim.scene import Scene
 from foveasim.sensor import Footprints, Sensor
 from foveasim.units import w_from_w_m2_um2

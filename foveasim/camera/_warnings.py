@@ -14,7 +14,7 @@ from foveasim.distortion import Lens
 from foveasim.errors import CoverageWarning, ExposureWarning, FoveasimWarning, ParameterError, SamplingWarning, warn
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
-from foveasim.layout import Layout
+from foveasim.layout.model import Layout
 from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor

@@ -27,7 +27,7 @@ from foveasim._core.rings import (
     site_bounds_um,
     site_moments,
 )
-from foveasim._core.show import Drawn, drawn
+from foveasim._core.show import Drawn, drawn, load
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import (
     MAX_LENGTH_UM,
@@ -557,14 +557,12 @@ class Layout:
 
     def write(self, path: str | Path, **options: Any) -> WrittenLayout:
         """Write to a file, format by extension; see :func:`foveasim.layout.write_layout`."""
-        from foveasim.layout.files import write_layout
-
+        write_layout = load("layout.files").write_layout
         return write_layout(self, path, **options)
 
     def describe(self, readout: Readout | None = None) -> Summary:
         """Return counts, sizes, areas, channels and lines; see :func:`foveasim.layout.describe`."""
-        from foveasim.layout.summary import describe
-
+        describe = load("layout.summary").describe
         return describe(self, readout)
 
     to_pyvista: ClassVar[Drawn[PolyData]] = drawn("polydata")
@@ -590,16 +588,14 @@ class Layout:
 
     def check(self, rules: DesignRules) -> Report:
         """Check design rules; violations are reported, not raised."""
-        from foveasim.layout.drc.rules import check
-
+        check = load("layout.drc.rules").check
         return check(self, rules)
 
     def enforce(
         self, rules: DesignRules, *, repair: Literal["best", "drop", "shrink", "merge", "refill"] = "best"
     ) -> tuple[Layout, Changes]:
         """Repair violations of design rules; see :func:`foveasim.layout.enforce`."""
-        from foveasim.layout.drc.repair import enforce
-
+        enforce = load("layout.drc.repair").enforce
         return enforce(self, rules, repair=repair)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim.errors import GeometryError
 from foveasim.layout.lattice import RectangleLattice
 from foveasim.layout.model import Layout
 
@@ -18,6 +19,9 @@ OUTLINES = ("xy_um", "ring_offsets", "site_offsets")
 LATTICE = ("lattice_x_um", "lattice_y_um")
 #: Prefix of the array name of a column.
 COLUMN_PREFIX = "column_"
+#: Rings and edges of a site are tested in pairs for intersection: maximum number of pairs, and maximum per ring or vertex.
+MAX_RING_PAIRS, PAIRS_PER_RING = 2_000_000, 100
+MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX = 1_000_000_000, 1000
 
 
 def layout_to_arrays(layout: Layout, *, is_compact: bool = False) -> dict[str, NDArray[Any]]:
@@ -33,6 +37,21 @@ def layout_to_arrays(layout: Layout, *, is_compact: bool = False) -> dict[str, N
     return arrays | {COLUMN_PREFIX + name: values for name, values in layout.columns.items()}
 
 
+def check_sizes(n_rings: NDArray[Any], n_vertices: NDArray[Any]) -> None:
+    """
+    Reject sites with too many rings or vertices.
+
+    Tests for intersections between them would take minutes.
+    """
+    for what, n, at_most, at_most_per_item in (
+        ("rings", n_rings, MAX_RING_PAIRS, PAIRS_PER_RING),
+        ("vertices", n_vertices, MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX),
+    ):
+        if np.sum(n.astype(np.float64) ** 2) > at_most + at_most_per_item * n.sum():
+            site = int(np.argmax(n))
+            raise GeometryError(f"site {site} has {n[site]} {what}, too many for a photosite", (site,))
+
+
 def layout_from_arrays(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any]) -> Layout:
     """
     Build a layout from named arrays; only structure and holes of the outlines are checked.
@@ -40,8 +59,6 @@ def layout_from_arrays(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[s
     Raises KeyError when an array of the outlines is missing. Raises GeometryError, ParameterError when array sizes are
     inconsistent, holes do not lie in their outlines, or a column is malformed.
     """
-    from foveasim.layout.files._common import check_sizes
-
     columns = {
         name.removeprefix(COLUMN_PREFIX): values for name, values in arrays.items() if name.startswith(COLUMN_PREFIX)
     }

@@ -14,7 +14,7 @@ from foveasim._core.provenance import to_plain_data
 from foveasim._core.validation import Floats, Ints
 from foveasim._io.sandbox import read_in_sandbox
 from foveasim.errors import FileError, ParameterError
-from foveasim.layout import Layout
+from foveasim.layout.model import Layout
 from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 
 FORMAT, VERSION = "foveasim events", 2

@@ -19,7 +19,7 @@ from foveasim._io.atomic import atomic_write, check_free_space
 from foveasim._io.formats import as_file_error
 from foveasim._io.npz import open_archive, write_archive
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, type_name, warn
-from foveasim.layout import Layout
+from foveasim.layout.model import Layout
 from foveasim.layout.packed import OUTLINES, layout_from_arrays, layout_to_arrays
 from foveasim.modes import _hdf5
 

@@ -23,7 +23,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Floats, Ints, check_per_site, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError, type_name
-from foveasim.layout import Layout
+from foveasim.layout.model import Layout
 from foveasim.modes.events import Events
 from foveasim.sensor import Sensor
 from foveasim.sensor.effects import ShotNoise

@@ -16,7 +16,7 @@ from foveasim._core.calls import NOT_NEGATIVE, check_declared
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_per_site, finite_array
 from foveasim.errors import SimulationError
-from foveasim.layout import Layout
+from foveasim.layout.model import Layout
 from foveasim.sensor.limits import DURATION, EXPOSURE
 
 __all__ = ["Between", "Exposure", "Shutter"]

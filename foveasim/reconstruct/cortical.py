@@ -34,7 +34,7 @@ from foveasim._core.validation import (
 )
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
-from foveasim.layout import Layout
+from foveasim.layout.model import Layout
 from foveasim.reconstruct.picture import Picture
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from foveasim._io.images import picture_format, write_picture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, Lattice, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
-from foveasim.layout import Layout
 from foveasim.layout.gaps import close_gaps
+from foveasim.layout.model import Layout
 from foveasim.reconstruct.colour import check_matrix
 from foveasim.units import decode_srgb
 from foveasim.units import encode_srgb as encoded_in_srgb

@@ -16,8 +16,9 @@ from foveasim._core.registry import Registry
 from foveasim._core.rings import site_area_um2
 from foveasim._core.validation import MAX_SITES, Floats
 from foveasim._io.formats import FileFormat
-from foveasim.errors import FileError, GeometryError, ParameterError
+from foveasim.errors import FileError, ParameterError
 from foveasim.layout.model import Layout, layout_of
+from foveasim.layout.packed import check_sizes
 
 #: Formats of layout files. ``read(path, **options)`` returns a :class:`foveasim.Layout`, ``write(layout, path, **options)`` a
 #: :class:`foveasim.layout.WrittenLayout`. Installed packages add formats as entry points of the group ``foveasim.formats``.
@@ -30,9 +31,6 @@ MAX_DECOMPRESSED_BYTES = 8 * 2**30
 MIN_DECOMPRESSED_BYTES, DECOMPRESSED_PER_BYTE = 2**26, 128
 #: A string column requires the memory of its longest string in every row: maximum, and maximum per character.
 MIN_STRING_BYTES, STRING_BYTES_PER_CHAR = 2**28, 64
-#: Rings and edges of a site are tested in pairs for intersection: maximum number of pairs, and maximum per ring or vertex.
-MAX_RING_PAIRS, PAIRS_PER_RING = 2_000_000, 100
-MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX = 1_000_000_000, 1000
 #: Kinds of numpy types that GeoJSON and GeoParquet support: booleans, integers, floating-point numbers, strings.
 PLAIN_KINDS = "biufU"
 
@@ -107,21 +105,6 @@ def check_site_count(path: Path, n_sites: int) -> None:
     """Reject a file with too many sites."""
     if n_sites > MAX_SITES:
         raise FileError(path, f"has {n_sites} sites, more than the maximum of {MAX_SITES}")
-
-
-def check_sizes(n_rings: NDArray[Any], n_vertices: NDArray[Any]) -> None:
-    """
-    Reject sites with too many rings or vertices.
-
-    Tests for intersections between them would take minutes.
-    """
-    for what, n, at_most, at_most_per_item in (
-        ("rings", n_rings, MAX_RING_PAIRS, PAIRS_PER_RING),
-        ("vertices", n_vertices, MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX),
-    ):
-        if np.sum(n.astype(np.float64) ** 2) > at_most + at_most_per_item * n.sum():
-            site = int(np.argmax(n))
-            raise GeometryError(f"site {site} has {n[site]} {what}, too many for a photosite", (site,))
 
 
 def layout_from_untrusted(

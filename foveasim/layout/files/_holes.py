@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from foveasim._core.rings import positions_in_runs, ring_area_um2
 from foveasim._core.validation import Floats, Ints
-from foveasim.layout.files._common import check_sizes
 from foveasim.layout.model import Layout, layout_of, valid_sites
+from foveasim.layout.packed import check_sizes
 
 Point: TypeAlias = tuple[float, float]
 

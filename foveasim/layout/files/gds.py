@@ -62,7 +62,6 @@ from foveasim.layout.files._common import (
     FORMATS,
     WrittenLayout,
     check_site_count,
-    check_sizes,
     layout_from_untrusted,
     rounding_report,
 )
@@ -82,6 +81,7 @@ from foveasim.layout.files._layers import (
     parse_selection,
 )
 from foveasim.layout.model import Layout, layout_of
+from foveasim.layout.packed import check_sizes
 
 __all__ = ["GDS_MAGIC", "OASIS_MAGIC", "read", "write"]
 
