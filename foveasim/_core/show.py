@@ -1,4 +1,4 @@
-"""Methods that are functions of higher floors, such as those that draw: imported by name, on use."""
+"""Methods that are functions of higher floors, such as those that draw, loaded on use."""
 
 from __future__ import annotations
 
