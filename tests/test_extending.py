@@ -36,6 +36,7 @@ from types import SimpleNamespace
 import numpy as np
 import foveasim as fs
 from foveasim.studio._parts.requirements import requirements
+from foveasim.studio._settings.controls import controls_of
 from foveasim.config import read_shot, schema
 from foveasim.metrics import METRICS
 from foveasim.testing import check_extension, extensions
@@ -64,7 +65,11 @@ compared = fs.compare.cameras({"one": shot.camera, "other": shot.camera}, {"moon
                               max_pixels=16, metrics=[name])
 compared.write("report.html")
 rows, _ = requirements(SimpleNamespace(shot=limited, capture=capture))
+demo = {key: each for key, each in fs.config.read_settings(fs.config.demo_settings()[0]).items() if key != "sensor"}
+choices = [each for control in controls_of(demo) if control["id"] == "layout" for each in control["choices"]]
+chosen = next(each["value"] for each in choices if each["label"] == "daisy")
 uses = {
+    "generator in the studio": fs.config.build_shot(None, {**demo, "layout": chosen}).camera.layout.n_sites > 3,
     "sweep": swept[name].values.tolist()[1] >= 0,
     "study": len(studied.trials) == 2 and studied.best_value >= 0,
     "requirement": fs.explore.check_requirements(limited, capture)[0].value == capture.code[3],
@@ -74,7 +79,7 @@ uses = {
     "schema": name in json.dumps(fs.explore.schema_of("sweep")),
 }
 print(json.dumps({
-    "uses of the metric": sorted(use for use, is_right in uses.items() if is_right),
+    "uses": sorted(use for use, is_right in uses.items() if is_right),
     "checked": len({kind for kind, _ in own}) == len({kind for kind, _ in extensions()}) == len(own) - 1,
     "generator": capture.layout.provenance["generator"],
     "effects": [effect.name for effect in shot.camera.sensor.chain],
@@ -110,7 +115,9 @@ def extended(tmp_path_factory):
 def test_installed_package_extends_every_kind(extended):
     assert extended.returncode == 0, extended.stderr
     assert json.loads(extended.stdout) == {
-        "uses of the metric": ["comparison", "goal seek", "requirement", "schema", "studio", "study", "sweep"],
+        "uses": [
+            "comparison", "generator in the studio", "goal seek", "requirement", "schema", "studio", "study", "sweep",
+        ],
         "checked": True,
         "generator": "daisy",
         "effects": ["shot", "read", "supply_ripple"],

@@ -32,7 +32,11 @@ LAYOUTS: Registry[Callable[..., Layout]] = Registry("layout family", "foveasim.l
 
 
 def layout_family(
-    *, example: Mapping[str, Any], picture: str | None = None, solve_for: Sequence[SolveFor] = ()
+    *,
+    example: Mapping[str, Any],
+    picture: str | None = None,
+    solve_for: Sequence[SolveFor] = (),
+    has_mosaic: bool | None = None,
 ) -> Callable[[Callable[P, Layout]], Callable[P, Layout]]:
     """
     Register a generator, and record its parameters in the provenance of layouts.
@@ -46,10 +50,13 @@ def layout_family(
     solve_for : sequence of SolveFor
         Parameters that the number of sites determines, in order of preference: the first one that is None is solved for when
         the parameter ``n_sites`` is given. The generator declares ``n_sites: int | None = None`` and never receives it.
+    has_mosaic : bool, optional
+        Whether the sites can have a :func:`mosaic`, since they are in rows and columns, or rings and sectors; by default
+        whether those of the example can.
 
     Notes
     -----
-    The decorated function has the attributes ``picture`` and ``solve_for``. Parameters are recorded as plain
+    The decorated function has the attributes ``picture``, ``solve_for`` and ``has_mosaic``. Parameters are recorded as plain
     data. To record one in another form, a generator includes it in the ``"parameters"`` of its own provenance.
 
     Examples
@@ -91,7 +98,8 @@ def layout_family(
             parameters = {key: _to_plain(value) for key, value in given.arguments.items()} | own.pop("parameters", {})
             return layout.with_provenance({"generator": name, "parameters": parameters, **own})
 
-        family.picture, family.solve_for = picture, tuple(solve_for)  # type: ignore[attr-defined]
+        for fact, value in (("picture", picture), ("solve_for", tuple(solve_for)), ("has_mosaic", has_mosaic)):
+            setattr(family, fact, value)
         return LAYOUTS.register(name, family, example=example)
 
     return decorate

@@ -6,7 +6,14 @@ import json
 
 import pytest
 
-from foveasim.config import build_shot, check_settings, get_setting, schema
+from foveasim.config import build_shot, check_settings, get_setting, put_setting, schema
+from foveasim.distortion import LENSES
+from foveasim.layout import EDITS, LAYOUTS
+from foveasim.optics import PUPILS
+from foveasim.scene import SCENES
+from foveasim.sensor import PIXEL_OPTICS
+from foveasim.sensor.effects import EFFECTS
+from foveasim.sensor.spectral import CURVES
 from foveasim.studio._files import start_settings
 from foveasim.studio._settings import controls as _controls
 from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of
@@ -129,6 +136,29 @@ def test_choices_are_valid_settings(demo, controls):
             n_checked += 1
 
     assert n_checked > 80
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::foveasim.errors.FoveasimWarning")
+def test_sections_start_without_an_error(demo, controls):
+    """Shots with each section that can be chosen can be built; layouts without filters, which the session adds."""
+    built = set()
+    for control in controls:
+        for choice in () if "do" in control else control.get("choices", ()):
+            value = choice["value"]
+            if not isinstance(value, dict):
+                continue
+            settings = json.loads(json.dumps(demo))
+            put_setting(None, settings, control["key"], [value] if control["kind"] == "sections" else value)
+            if control["key"] == "layout" and "mosaic" not in value:
+                del settings["sensor"]["filters"]
+            build_shot(None, settings)
+            built.add(choice["label"])
+
+    for registry in (LAYOUTS, EDITS, SCENES, LENSES, EFFECTS, PUPILS, CURVES, PIXEL_OPTICS):
+        missing = {name for name in registry if name.replace("_", " ") not in built}
+        at_points = {name for name in missing if registry[name].__module__.endswith(".at_points")}
+        assert missing - at_points <= {"cube", "file", "picture", "image"}, registry.kind  # of files
 
 
 def test_numbers_do_not_change_structure(demo):

@@ -13,7 +13,7 @@ from foveasim.layout import LAYOUTS
 from foveasim.studio._files import start_settings
 from foveasim.studio._session import Start
 from foveasim.studio._settings.controls import controls_of
-from foveasim.studio._settings.templates import SECTIONS, WITHOUT_MOSAIC
+from foveasim.studio._settings.templates import SECTIONS
 from foveasim.studio._settings.unknowns import unknown_of, unknowns_of, with_unknown
 
 
@@ -27,7 +27,7 @@ def choose(recorder, label, **message):
 
 
 @pytest.mark.slow(keep=1)
-@pytest.mark.parametrize("other", WITHOUT_MOSAIC)
+@pytest.mark.parametrize("other", ["penrose", "quadtree", "sunflower", "voronoi"])
 def test_colouring_ends_with_its_generator(recorder, settings, other):
     before = choose(recorder, "grid")["settings"]["layout"]
     coloured = choose(recorder, other)["settings"]["layout"]

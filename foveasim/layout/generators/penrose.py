@@ -34,6 +34,7 @@ DECAGON_INRADIUS_RATIO = math.cos(math.pi / 10.0)
 
 
 @layout_family(
+    has_mosaic=False,
     example={"side_um": 2.0, "size_um": 30.0},
     solve_for=(
         SolveFor(

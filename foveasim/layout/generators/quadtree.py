@@ -21,6 +21,7 @@ MAX_LEVELS = 15
 
 
 @layout_family(
+    has_mosaic=False,
     example={
         "importance": np.exp(-np.hypot(*np.mgrid[-32:32, -32:32]) / 6.0),
         "pitch_um": 0.5,

@@ -24,7 +24,7 @@ SPIRAL_FACTOR = 1.0 / math.sqrt(5.0 - 4.0 * math.cos(3.0 * GOLDEN_ANGLE_RAD))
 MIN_CHORDS = 64
 
 
-@layout_family(example={"n_sites": 300, "spacing_um": 1.6})
+@layout_family(has_mosaic=False, example={"n_sites": 300, "spacing_um": 1.6})
 def sunflower(
     n_sites: Annotated[int, SITES], spacing_um: Annotated[float, LENGTH], *, n_chords: int | None = None
 ) -> Layout:

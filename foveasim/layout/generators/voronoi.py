@@ -64,7 +64,9 @@ MAX_NEWTON_STEPS, MIN_DAMPING = 30, 0.01
 REGULARISATION_FACTOR, N_REGULARISATIONS = 0.25, 16
 
 
-@layout_family(example={"n_sites": 200, "size_um": (32.0, 32.0), "n_iterations": 20}, picture="density")
+@layout_family(
+    has_mosaic=False, example={"n_sites": 200, "size_um": (32.0, 32.0), "n_iterations": 20}, picture="density"
+)
 def voronoi(
     n_sites: Annotated[int, SITES],
     *,

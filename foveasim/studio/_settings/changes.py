@@ -9,10 +9,11 @@ from typing import Any
 from foveasim.config import get_setting, put_setting
 from foveasim.config._models import expand_preset
 from foveasim.errors import ParameterError, printable
+from foveasim.layout import LAYOUTS
 from foveasim.sensor import PRESETS
 from foveasim.studio._files import Files, with_layout
 from foveasim.studio._settings.controls import controls_of
-from foveasim.studio._settings.templates import WITHOUT_MOSAIC
+from foveasim.studio._settings.templates import has_mosaic
 
 #: Messages that change the settings.
 CHANGES = (
@@ -154,15 +155,20 @@ def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:
         return
     old = old if isinstance(old, dict) else {}
     edits = list(layout.get("edits") or [])
-    if old.get("generator") in WITHOUT_MOSAIC and layout["generator"] not in WITHOUT_MOSAIC and COLOURING in edits:
+    if (
+        COLOURING in edits
+        and old.get("generator") in LAYOUTS
+        and not has_mosaic(old["generator"])
+        and has_mosaic(layout["generator"])
+    ):
         edits.remove(COLOURING)
     is_coloured = isinstance(sensor, dict) and sensor.get("filters") is not None
     was_coloured = isinstance(before.get("sensor"), dict) and before["sensor"].get("filters") is not None
-    if was_coloured and not is_coloured and layout["generator"] in WITHOUT_MOSAIC and COLOURING in edits:
+    if was_coloured and not is_coloured and COLOURING in edits and not has_mosaic(layout["generator"]):
         edits.remove(COLOURING)
     if is_coloured:
         has_filters = any(edit.get("kind") in COLOURING_KINDS for edit in edits if isinstance(edit, dict))
-        if layout["generator"] in WITHOUT_MOSAIC:
+        if not has_mosaic(layout["generator"]):
             layout.pop("mosaic", None)
             if not has_filters:
                 edits.append(dict(COLOURING))

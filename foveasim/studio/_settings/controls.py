@@ -13,7 +13,7 @@ from typing import Any
 from foveasim._core.validation import UNIT_SUFFIXES
 from foveasim.config import bundled_layouts, get_setting, schema
 from foveasim.studio._settings.labels import words_of
-from foveasim.studio._settings.templates import INITIAL, PER_AREA, WITHOUT_MOSAIC, templates
+from foveasim.studio._settings.templates import INITIAL, PER_AREA, has_mosaic, templates
 from foveasim.studio._settings.unknowns import PARAMETERS, unknown_of, unknowns_of
 
 __all__ = ["chosen_value", "controls_of", "structure_of"]
@@ -438,7 +438,7 @@ def _initial(root: dict[str, Any], option: dict[str, Any], value: Any) -> dict[s
     # Scenes with a single band require its width.
     if "band_width_nm" in option["properties"] and not (isinstance(wavelength_nm, list) and len(wavelength_nm) > 1):
         found.setdefault("band_width_nm", INITIAL["band_width_nm"])
-    if found.get("generator") in WITHOUT_MOSAIC:
+    if "mosaic" in found and not has_mosaic(found.get("generator", "")):
         found.pop("mosaic", None)
     return found
 

@@ -2,8 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
+from foveasim._core.registry import Registry
+from foveasim.distortion import LENSES
+from foveasim.errors import FoveasimError
+from foveasim.layout import EDITS, LAYOUTS, mosaic
+from foveasim.optics.pupils import PUPILS
+from foveasim.scene.registry import SCENES
+from foveasim.sensor import PIXEL_OPTICS
+from foveasim.sensor.effects import EFFECTS
+from foveasim.sensor.spectral import CURVES
+
+#: Module of edits whose parameters are points of the layout, which examples of other layouts do not have.
+OF_POINTS = "foveasim.layout.edits.at_points"
+#: A mosaic, to find out whether a layout can have one.
+BLOCK = ["RG", "GB"]
 #: Initial values of required parameters by name.
 INITIAL: dict[str, Any] = {
     "band_width_nm": 100.0,
@@ -27,8 +43,9 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "annulus kind": {"obscuration": 0.3},
     "bars kind": {"groups": [-3, -2, -1]},
     "blades kind": {"n_blades": 6},
+    "chief ray table": {"image_height_um": [0.0, 500.0, 1000.0], "angle_deg": [0.0, 5.0, 10.0]},
     "checkerboard kind": {"square_mm": 16.0},
-    "clip kind": {"region": [[-200.0, -200.0], [200.0, -200.0], [200.0, 200.0], [-200.0, 200.0]]},
+    "clip kind": {"region": [[-200.0, -200.0], [200.0, -200.0], [200.0, 200.0], [-200.0, 200.0]], "cut": "drop"},
     "colour_chart kind": {"patch_mm": 35.0},
     "constant kind": {"value": 0.6},
     "coupling": {"neighbour_fraction": 0.01},
@@ -60,7 +77,7 @@ SECTIONS: dict[str, dict[str, Any]] = {
     },
     "pass_band kind": {"from_nm": 420.0, "to_nm": 680.0},
     "penrose parameters": {"size_um": 800.0, "side_um": 12.0},
-    "point_grid kind": {"spacing_mm": 16.0},
+    "point_grid kind": {"spacing_mm": 16.0, "pitch_um": 500.0},
     "point_sources kind": {"pixels": [[256, 256]]},
     "polynomial kind": {"wavelength_nm": [400.0, 500.0, 600.0, 700.0], "value": [0.3, 0.6, 0.6, 0.4], "degree": 3},
     "polynomial_fisheye kind": {"k": [0.0, 0.0, 0.0, 0.0]},
@@ -68,7 +85,9 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "quadtree parameters": {"importance": "skimage:camera", "pitch_um": 4.0, "n_levels": 5, "n_sites": 5000},
     "readout": {"frames_per_s": 30.0, "bits": 10},
     "random_channels kind": {"fractions": [1.0, 2.0, 1.0], "seed": 0},
+    "relative illumination table": {"image_height_um": [0.0, 500.0, 1000.0], "fraction": [1.0, 0.95, 0.8]},
     "repair kind": {"rules": {"min_size_um": 2.0}},
+    "requirement": {"measure": "snr", "at_least": 10.0},
     "rotate kind": {"angle_deg": 15.0},
     "routing": {"width_um": 0.2, "space_um": 0.2},
     "scale kind": {"factor": 1.2},
@@ -99,10 +118,47 @@ PER_AREA: dict[str, float] = {
     "read_noise_e": 0.05,
     "sensitivity": 0.001,
 }
-#: Generators whose sites are not in rows and columns, or rings and sectors, which a mosaic needs.
-WITHOUT_MOSAIC = ("penrose", "quadtree", "sunflower", "voronoi")
+#: Registries of the sections whose titles in the schema end with a word.
+REGISTRIES: dict[str, tuple[Registry[Any], ...]] = {
+    "kind": (SCENES, LENSES, PUPILS, CURVES, EFFECTS, PIXEL_OPTICS, EDITS),
+    "parameters": (LAYOUTS,),
+}
 
 
 def templates(title: str) -> dict[str, Any]:
-    """Return the initial values of a section by its title in the schema."""
-    return SECTIONS.get(title, {})
+    """
+    Return the initial values of a section by its title in the schema.
+
+    Registered kinds without values of the page have those of their examples.
+    """
+    if title in SECTIONS:
+        return SECTIONS[title]
+    name, _, word = title.rpartition(" ")
+    for registry in REGISTRIES.get(word, ()):
+        item = registry.get(name)
+        example = None if item is None or item.__module__ == OF_POINTS else registry.example(name)
+        if isinstance(example, Mapping):
+            return {key: _plain(value) for key, value in example.items()}
+    return {}
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as settings files contain it."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    return [_plain(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def has_mosaic(generator: str) -> bool:
+    """Return whether the sites of a generator are in rows and columns, or rings and sectors."""
+    declared: bool | None = getattr(LAYOUTS.get(generator), "has_mosaic", False)
+    return _has_mosaic(generator, LAYOUTS.version) if declared is None else declared
+
+
+@lru_cache(maxsize=64)
+def _has_mosaic(generator: str, _version: int) -> bool:
+    try:
+        mosaic(LAYOUTS[generator](**LAYOUTS.example(generator)), BLOCK)
+    except (FoveasimError, TypeError, ValueError):  # no rows and columns, or an example with files
+        return False
+    return True

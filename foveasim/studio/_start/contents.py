@@ -10,7 +10,7 @@ from foveasim.layout.families import summary_of
 from foveasim.sensor import PRESETS
 from foveasim.studio._engine import MAX_SITES
 from foveasim.studio._files import Files, preset_paths, presets, thumbnail_name
-from foveasim.studio._settings.templates import WITHOUT_MOSAIC
+from foveasim.studio._settings.templates import has_mosaic
 from foveasim.studio._start.new_sensor import BAYER, RECTANGULAR, electronics, generators, mosaics
 from foveasim.studio._start.recent import recent_files
 
@@ -65,7 +65,7 @@ def _generator(name: str) -> dict[str, Any]:
         "label": name.replace("_", " "),
         "text": f"{text[:1].upper()}{text[1:]}.",
         "fills_format": name in RECTANGULAR,
-        "has_mosaic": name not in WITHOUT_MOSAIC,
+        "has_mosaic": has_mosaic(name),
     }
 
 
