@@ -116,7 +116,14 @@ def test_installed_package_extends_every_kind(extended):
     assert extended.returncode == 0, extended.stderr
     assert json.loads(extended.stdout) == {
         "uses": [
-            "comparison", "generator in the studio", "goal seek", "requirement", "schema", "studio", "study", "sweep",
+            "comparison",
+            "generator in the studio",
+            "goal seek",
+            "requirement",
+            "schema",
+            "studio",
+            "study",
+            "sweep",
         ],
         "checked": True,
         "generator": "daisy",

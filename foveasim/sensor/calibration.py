@@ -418,7 +418,7 @@ def calibrate(
     flat = np.ascontiguousarray(_one_or_per_site("flat_e", CHARGE.check_array("flat_e", flat_e), n_sites, above=0.0))
     zero_e = np.zeros(n_sites)
     # Noisy sites are those with more noise than sites without defects.
-    dark, lit = (sensor.linearise_intact(photo_e / exposure_s, exposure_s) for photo_e in (zero_e, flat))
+    dark, lit = (sensor.linearise_without_defects(photo_e / exposure_s, exposure_s) for photo_e in (zero_e, flat))
     dn_per_e = dark.linear_gain_dn_per_e
     table = None if sensor.adc.is_linear else sensor.adc.linear_dn
 

@@ -714,12 +714,12 @@ class Sensor:
 
     def _light_records(self, is_device_known: bool, exposure_s: float = 1.0) -> list[Record]:
         """Return the records from light to expected charge, without light."""
-        sensor = self if is_device_known else self._intact
+        sensor = self if is_device_known else self._without_defects
         sites = self.sites if is_device_known else self.sites.without_device()
         return light_records(sensor, sites, np.zeros(self.layout.n_sites), exposure_s)
 
     @cached_property
-    def _intact(self) -> Sensor:
+    def _without_defects(self) -> Sensor:
         """Sensor without defects, which shares its compiled effects."""
         found = self.without(*(effect.name for effect in self.chain if effect.is_defect))
         vars(found)["sites"] = self.sites
@@ -1123,9 +1123,11 @@ class Sensor:
         )
         return linearise(self, sites, expected, photo, exposure_s)
 
-    def linearise_intact(self, photo_e_per_s: Floats, exposure_s: float) -> Linearisation:
+    def linearise_without_defects(self, photo_e_per_s: Floats, exposure_s: float) -> Linearisation:
         """Compute :meth:`linearise` over all devices, without defects."""
-        return self._intact.linearise(photo_e_per_s=photo_e_per_s, exposure_s=exposure_s, is_device_known=False)
+        return self._without_defects.linearise(
+            photo_e_per_s=photo_e_per_s, exposure_s=exposure_s, is_device_known=False
+        )
 
     def invert(self, code: ArrayLike) -> Inverse:
         """

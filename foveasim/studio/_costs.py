@@ -6,11 +6,11 @@ from collections.abc import Iterable
 
 #: Simulations and views that take longer are reduced or left out while a control is dragged.
 SLOW_S = 0.15
-#: Rest after which a preview is replaced by the complete result.
-REST_S = 0.3
-#: Rest after which unused memory is returned to the operating system.
+#: Idle time after which a preview is replaced by the complete result.
+PREVIEW_IDLE_S = 0.3
+#: Idle time after which unused memory is returned to the operating system.
 RELEASE_S = 5.0
-#: Rest after which a session without a page releases its results.
+#: Idle time after which a session without a page releases its results.
 FORGET_S = 20.0
 #: Settings that no stage with a scene depends on.
 FAST_KEYS = ("exposure_s", "seed")

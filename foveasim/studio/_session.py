@@ -26,7 +26,7 @@ from foveasim.explore import measure
 from foveasim.explore.solving import search_value
 from foveasim.layout import Layout
 from foveasim.metrics import metric_info
-from foveasim.studio._costs import FORGET_S, RELEASE_S, REST_S, CancelledError, Costs, SupersededError
+from foveasim.studio._costs import FORGET_S, PREVIEW_IDLE_S, RELEASE_S, CancelledError, Costs, SupersededError
 from foveasim.studio._engine import Engine, Simulated
 from foveasim.studio._exports import log_of, text_of, without_directories
 from foveasim.studio._files import (
@@ -170,7 +170,7 @@ class Session:
         # Setting that changed last, and whether this was during a drag.
         self._key: str | None = None
         self._is_dragging = False
-        self._wants_rest = False
+        self._needs_complete_result = False
         self._has_unused_memory = False
         self._is_cancelled = self._is_working = False
         self._can_stop = False
@@ -318,20 +318,20 @@ class Session:
     def _handle_until_closed(self) -> None:
         while True:
             with self._wake:
-                while not self._waiting and not self._is_closed and self._wake.wait(self._rest_s):
+                while not self._waiting and not self._is_closed and self._wake.wait(self._idle_timeout_s):
                     pass
                 if self._is_closed:
                     return
                 messages = list(self._waiting)
                 self._waiting.clear()
-                is_sweeping = self._sweeps.is_running and not self._wants_rest
+                is_sweeping = self._sweeps.is_running and not self._needs_complete_result
                 # Points are interrupted by messages, not cancelled.
                 self._is_working = bool(messages) or not is_sweeping
             try:
                 if is_sweeping and not messages:
                     self._has_unused_memory = True
                     self._sweeps.compute_next(self.engine.simulate)
-                elif messages or self._wants_rest:
+                elif messages or self._needs_complete_result:
                     self._has_unused_memory = True
                     self._handle(messages) if messages else self._complete()
                 elif self._has_unused_memory:
@@ -346,10 +346,10 @@ class Session:
                     self._is_cancelled = self._is_working = False
 
     @property
-    def _rest_s(self) -> float | None:
+    def _idle_timeout_s(self) -> float | None:
         """Time without messages after which the thread has something to do; None for any time."""
-        if self._wants_rest:
-            return REST_S
+        if self._needs_complete_result:
+            return PREVIEW_IDLE_S
         if self._sweeps.is_running:
             return 0.0
         if self._has_unused_memory:
@@ -383,7 +383,7 @@ class Session:
                 self._change(changes)
                 changes, done = [], k + 1
                 try:
-                    self._other(message)
+                    self._answer(message)
                 except Exception as error:  # noqa: BLE001 -- messages of the page may cause any exception
                     self._last_id = message.get("id") if isinstance(message, dict) else None
                     self._send_error(self._last_id, error)
@@ -396,7 +396,7 @@ class Session:
         finally:
             self._is_cancelled = self._is_working = False
         self._send_parts()
-        self._wants_rest = self.is_preview
+        self._needs_complete_result = self.is_preview
 
     def _check(self, stage: str) -> None:
         """
@@ -443,7 +443,7 @@ class Session:
 
     def _complete(self) -> None:
         """Replace a preview by the complete result."""
-        self._is_dragging = self._wants_rest = False
+        self._is_dragging = self._needs_complete_result = False
         self._send({"kind": "busy"})
         try:
             self._simulate(self.history.settings)
@@ -525,7 +525,7 @@ class Session:
                 key = key_of(message)
                 settings = balanced(reset(settings, {}, key), key, before, self._generated)
             case "seek":
-                settings = self._sought(settings, message)
+                settings = self._with_solved_value(settings, message)
             case "fit":
                 if self.result is None:
                     raise SimulationError("there is no image to fit")
@@ -601,7 +601,7 @@ class Session:
         self.frames.show(message.get("n"))
         return self.gaze.at(settings, self.frames.time_s)
 
-    def _sought(self, settings: dict[str, Any], message: dict[str, Any]) -> dict[str, Any]:
+    def _with_solved_value(self, settings: dict[str, Any], message: dict[str, Any]) -> dict[str, Any]:
         """
         Return settings in which a requirement is met.
 
@@ -711,7 +711,7 @@ class Session:
         if before is not None and before != self._simulated_frame:
             self.engine.forget(before)
 
-    def _other(self, message: Any) -> None:
+    def _answer(self, message: Any) -> None:
         """Handle a message that does not change the settings."""
         if not isinstance(message, dict):
             raise ParameterError("message", "must be a JSON object")

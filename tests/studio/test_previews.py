@@ -242,7 +242,7 @@ def test_rest_releases_unused_memory(settings, make_threaded, monkeypatch):
         released.clear()
 
     # Once in each rest: the thread next wakes up to forget its result.
-    assert session._rest_s == _session.FORGET_S
+    assert session._idle_timeout_s == _session.FORGET_S
 
 
 @pytest.mark.slow

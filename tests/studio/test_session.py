@@ -693,7 +693,7 @@ def test_session_without_page_releases_its_results(settings, monkeypatch):
         captures = [weakref.ref(each.capture) for each in results]
         del results
         # Its thread has nothing more to do.
-        wait_until(lambda: session._rest_s is None)
+        wait_until(lambda: session._idle_timeout_s is None)
         assert session.result is not None
         session.detach(messages.append)
         wait_until(lambda: session.result is None and all(each() is None for each in captures))

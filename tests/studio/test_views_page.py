@@ -289,12 +289,12 @@ def test_drag_shows_previews_and_then_everything(visit, server, monkeypatch):
     monkeypatch.setattr(_engine, "PREVIEW_CELLS", 1 << 14)
     page = visit()
     (session,) = server.studio.sessions.values()
-    monkeypatch.setattr(_session, "REST_S", DEADLINE_S)
+    monkeypatch.setattr(_session, "PREVIEW_IDLE_S", DEADLINE_S)
     page.evaluate("() => { studio.connection.set('optics.f_number', 4, false); }")
     status = "/^preview, /.test(document.getElementById('status').textContent.trim())"
     until(page, f"() => {status} && studio.views.parts.columns?.is_preview && studio.state.is_preview")
     # Without further changes the complete result follows.
-    monkeypatch.setattr(_session, "REST_S", 0.0)
+    monkeypatch.setattr(_session, "PREVIEW_IDLE_S", 0.0)
     with session._wake:
         session._wake.notify()
     until(page, "() => studio.isIdle && !studio.connection.requests.isPreview && !studio.state.is_preview")
