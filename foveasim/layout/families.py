@@ -51,8 +51,8 @@ def layout_family(
         Parameters that the number of sites determines, in order of preference: the first one that is None is solved for when
         the parameter ``n_sites`` is given. The generator declares ``n_sites: int | None = None`` and never receives it.
     has_mosaic : bool, optional
-        Whether the sites can have a :func:`mosaic`, since they are in rows and columns, or rings and sectors; by default
-        whether those of the example can.
+        Whether the sites can have a mosaic (:func:`foveasim.layout.mosaic`), since they are in rows and columns, or rings and
+        sectors; by default whether those of the example can.
 
     Notes
     -----
