@@ -196,7 +196,8 @@ def _describe(kind: Any, error: Any, types: list[str], *, is_first: bool) -> str
             value = error["input"]
             return _not_one_of(_quoted(error["ctx"]["expected"]), value, json.dumps(value), types)
         case _:
-            got = "" if isinstance(error["input"], dict | list) else f", got {json.dumps(error['input'])}"
+            is_shown = isinstance(error["input"], dict | list) or ", got " in error["msg"]
+            got = "" if is_shown else f", got {json.dumps(error['input'])}"
             rule = re.sub(r"^\w+ should", "must", error["msg"].removeprefix("Value error, ")).replace(
                 " after validation", ""
             )

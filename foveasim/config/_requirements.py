@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field
-from pydantic_core import PydanticCustomError
 
 from foveasim.errors import ParameterError
 from foveasim.metrics.registry import METRICS, check_number_name, has_region, metric_info, options_of
@@ -18,11 +17,11 @@ def _number_names() -> list[str]:
 
 
 def _check_name(name: str) -> str:
-    """Check the name of a metric in a file; the message is that of a choice."""
-    if name not in _number_names():
-        expected = ", ".join(map(repr, _number_names()))
-        raise PydanticCustomError("literal_error", "must be the name of a metric", {"expected": expected})
-    return name
+    """Check the name of a metric in a file."""
+    try:
+        return check_number_name("measure", name)
+    except ParameterError as error:
+        raise ValueError(error.detail) from None
 
 
 #: Names of metrics that are one number, with those of installed packages.
