@@ -407,7 +407,8 @@ class Optics(PointImages):
 
     def _view(self, scene: SceneLike) -> View:
         """Return what follows from the geometry and the wavelengths of a scene."""
-        key = scene.basis.shape[1:], scene.pitch_um, scene.distance_m, scene.centre_um, scene.wavelength_nm.tobytes()
+        geometry = scene.basis.shape[1:], scene.pitch_um, scene.distance_m, tuple(scene.centre_um)
+        key = *geometry, scene.wavelength_nm.tobytes()
         found: View = self._cache.views.get(key, lambda: self._make_view(scene))
         return found
 
