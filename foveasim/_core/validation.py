@@ -96,6 +96,13 @@ def unit_of(name: str) -> str:
     return next((unit for suffix, unit in UNIT_SUFFIXES.items() if name.lower().endswith(suffix)), "")
 
 
+def words_and_unit(name: str) -> tuple[str, str]:
+    """Return a name in words without the suffix of its unit, and the unit."""
+    suffix = next((s for s in UNIT_SUFFIXES if name.endswith(s) and len(s) < len(name)), "")
+    unit = UNIT_SUFFIXES.get(suffix, "")
+    return (name.removesuffix(suffix) if unit else name).replace("_", " "), unit
+
+
 def check_number(
     name: str,
     value: object,
@@ -337,18 +344,18 @@ def finite_array(
 
 def check_broadcast(**arrays: NDArray[Any]) -> tuple[int, ...]:
     """Return the common shape of arrays, by the names of their parameters."""
-    with suppress(ValueError):
-        return np.broadcast_shapes(*(array.shape for array in arrays.values()))
     names = list(arrays)
-    for n in range(2, len(names) + 1):
+    for n in range(len(names), 0, -1):
         try:
-            np.broadcast_shapes(*(arrays[name].shape for name in names[:n]))
+            common = np.broadcast_shapes(*(arrays[name].shape for name in names[:n]))
         except ValueError:
-            others = ", ".join(f"'{name}' {arrays[name].shape}" for name in names[: n - 1])
-            raise ParameterError(
-                names[n - 1], f"must have a shape that broadcasts with {others}, got {arrays[names[n - 1]].shape}"
-            ) from None
-    raise AssertionError("unreachable")
+            continue
+        if n == len(names):
+            return common
+        others = ", ".join(f"'{name}' {arrays[name].shape}" for name in names[:n])
+        rule = f"must have a shape that broadcasts with {others}, got {arrays[names[n]].shape}"
+        raise ParameterError(names[n], rule)
+    return ()
 
 
 def as_broadcast(**arrays: ArrayLike) -> list[NDArray[Any]]:

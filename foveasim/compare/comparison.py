@@ -227,9 +227,8 @@ class Comparison:
         for attribute, _, unit in BUDGETS.values():
             numbers = [getattr(budget, attribute) for budget in self.budgets]
             coordinates[attribute] = ("camera", numbers, {"units": unit or "1"})
-        variables = {
-            name: each for name, each in variables.items() if name not in coordinates
-        }  # metrics that are budgets
+        for name in coordinates.keys() & variables.keys():  # metrics that are budgets
+            del variables[name]
         return xr.Dataset(variables, coordinates, {"settings": json.dumps(self.settings)})
 
     def plot(self) -> NDArray[Any]:

@@ -278,6 +278,7 @@ def _information(shot: MetricShot, camera: Camera, capture: Capture) -> dict[str
 @METRICS.register(
     "information_bit_per_site",
     info=MetricInfo(
+        better="high",
         title="information per site",
         unit="bit",
         definition="Gaussian estimate of the information about the scenes, per site",
@@ -291,6 +292,7 @@ def information_bit_per_site(shot: MetricShot, camera: Camera, capture: Capture)
 @METRICS.register(
     "information_bit_per_mm2",
     info=MetricInfo(
+        better="high",
         title="information per area",
         unit="bit/mm²",
         definition="the same, per area of the sites",
@@ -338,12 +340,13 @@ def metric_rows(names: Sequence[str], interval_of: Callable[[str], MedianInterva
 
 
 def best_cameras(names: Sequence[str], interval_of: Callable[[str], MedianInterval]) -> list[int | None]:
-    """Return the camera with the best value of each metric; None if there are several."""
+    """Return the best camera of each metric; None for several, or no better direction."""
     found: list[int | None] = []
     for name in names:
-        values = (-1.0 if metric_info(name).better == "low" else 1.0) * np.asarray(interval_of(name).median, np.float64)
+        better = metric_info(name).better
+        values = (-1.0 if better == "low" else 1.0) * np.asarray(interval_of(name).median, np.float64)
         best = np.flatnonzero(values == values.max(initial=-np.inf))
-        found.append(int(best[0]) if best.size == 1 else None)
+        found.append(int(best[0]) if best.size == 1 and better is not None else None)
     return found
 
 

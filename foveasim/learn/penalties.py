@@ -112,7 +112,7 @@ def barrier(
     shape = _Shape(points, outlines, rules.angle_limit_deg)
     penalty = points.new_zeros(())
     for name, limit in limits.items():
-        for clearance, factor in CLEARANCES_OF[name](shape, limit, margin_fraction):
+        for clearance, factor in CLEARANCES[name](shape, limit, margin_fraction):
             penalty = penalty + (factor * _smooth_log(clearance / margin_fraction, quadratic_fraction)).sum()
     if convex:
         penalty = penalty + _smooth_log(shape.turning_sines() / margin_fraction, quadratic_fraction).sum()
@@ -125,8 +125,8 @@ def _limits(rules: DesignRules) -> dict[str, float]:
     for name, limit in rules.limits().items():
         if name in (rules.waivers or {}) or name in CONSTANT_RULES:
             continue
-        if name not in CLEARANCES_OF:
-            supported = ", ".join(f"'{each}'" for each in CLEARANCES_OF)
+        if name not in CLEARANCES:
+            supported = ", ".join(f"'{each}'" for each in CLEARANCES)
             raise ParameterError(
                 "rules", f"must have limits of {supported} only, got '{name}'",
                 hint="remove it with rules.only, waive it, or repair the final layout",
@@ -407,7 +407,7 @@ def _max_neighbour_ratio(shape: _Shape, limit: float, margin_fraction: float) ->
 
 
 #: Clearances of the supported rules.
-CLEARANCES_OF: dict[str, Callable[[_Shape, float, float], Clearances]] = {
+CLEARANCES: dict[str, Callable[[_Shape, float, float], Clearances]] = {
     "min_size_um": _min_size,
     "max_size_um": _max_size,
     "min_area_um2": _min_area,

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import UNIT_SUFFIXES, Ints, check_choice, unit_of
+from foveasim._core.validation import Floats, Ints, check_choice, words_and_unit
 from foveasim.camera import Camera
 from foveasim.capture import Capture
 from foveasim.errors import SimulationError
@@ -95,8 +94,8 @@ class MetricInfo:
         By default that of the name's suffix, such as ``_dn``.
     definition : str
         By default the first line of the function's docstring.
-    better : {"high", "low"}
-        Which values are better.
+    better : {"high", "low"}, optional
+        Which values are better; None for neither, as of the mean code.
     has_scene : bool
         Whether it depends on the scene, or on the layout and the lens alone.
     is_logarithmic : bool
@@ -122,7 +121,7 @@ class MetricInfo:
     title: str = ""
     unit: str = ""
     definition: str = ""
-    better: Literal["high", "low"] = "high"
+    better: Literal["high", "low"] | None = None
     has_scene: bool = True
     is_logarithmic: bool = False
     headline: str = ""
@@ -149,22 +148,16 @@ def metric_info(name: str) -> MetricInfo:
     """
     function = METRICS.find("metric", name)
     found: MetricInfo = METRICS.info(name) or MetricInfo()
-    unit = unit_of(name) if not found.unit and not found.title else found.unit
-    words = name.removesuffix(_suffix_of(name)).replace("_", " ")
+    words, unit = words_and_unit(name)
     summary = (inspect.getdoc(function) or "").partition("\n")[0]
-    return MetricInfo(**{
-        **vars(found),
-        "title": found.title or words,
-        "unit": unit,
-        "definition": found.definition or summary.removeprefix("Return ").removesuffix("."),
-    })  # fmt: skip
+    return replace(
+        found,
+        title=found.title or words,
+        unit=found.unit if found.unit or found.title else unit,
+        definition=found.definition or summary.removeprefix("Return ").removesuffix("."),
+    )
 
 
-def _suffix_of(name: str) -> str:
-    return next((suffix for suffix, unit in UNIT_SUFFIXES.items() if unit and name.endswith(suffix)), "")
-
-
-@lru_cache(maxsize=256)
 def options_of(metric: Metric) -> tuple[str, ...]:
     """Return the names of the parameters of a metric after shot, camera and capture."""
     return tuple(inspect.signature(metric).parameters)[3:]
@@ -227,7 +220,7 @@ def sites_of(region: Region, layout: Layout) -> Ints:
     return found
 
 
-def centre_um_of(layout: Layout) -> np.ndarray[Any, np.dtype[np.float64]]:
+def centre_um_of(layout: Layout) -> Floats:
     """Return the centre of the bounding box, (x, y) µm."""
     x0, y0, x1, y1 = layout.bounds_um
     return np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])

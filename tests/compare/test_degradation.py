@@ -49,9 +49,12 @@ def qualities(dead_fraction, exposure_s):
     shot = Shot(name="s", scene=scene(), camera=camera, rules=None, requested_s=exposure_s, seed=0)
     capture = camera.capture(scene(), exposure_s=exposure_s, seed=0)
     found |= {f"metric snr {key}": value for key, value in METRICS["snr"](shot, camera, capture).items()}
-    found["metric psnr_db"] = METRICS["psnr_db"](shot, camera, capture)
-    for name in ("snr", "snr_db", "psnr_db"):
-        found[f"result {name}"] = fs.explore.measure(RegionResult(measure=name), shot, capture)
+    for name in METRICS:
+        info = metric_info(name)
+        if info.has_scene and info.is_number and info.better is not None:
+            options = {"frequency_per_mm": 50.0} if name == "mtf" else {}
+            value = fs.explore.measure(RegionResult(measure=name, **options), shot, capture)
+            found[f"result {name}"] = -value if info.better == "low" else value
     found["snr_by_class"] = float(fs.metrics.snr_by_class(camera, scene(), exposure_s=exposure_s).snr[0])
     return found, capture.saturated_fraction
 

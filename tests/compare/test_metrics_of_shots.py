@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import foveasim as fs
-from foveasim.compare.measure import ComparedShot
+from foveasim.compare.measure import ComparedShot, best_cameras
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.metrics import METRICS, MetricInfo, metric_info
 from foveasim.metrics.registry import number_of
@@ -38,7 +38,11 @@ def scene():
 def compared(camera, scene):
     pair = {"one": camera, "other": camera}
     return fs.compare.cameras(
-        pair, {"blocks": scene}, exposure_s=0.01, max_pixels=64, metrics=["snr", "n_sites", "exposure_s"]
+        pair,
+        {"blocks": scene},
+        exposure_s=0.01,
+        max_pixels=64,
+        metrics=["snr", "n_sites", "exposure_s", "mean_code_dn"],
     )
 
 
@@ -49,6 +53,17 @@ def test_metrics_equal_those_of_comparisons(camera, scene, compared):
         assert number_of(name, shot, camera, capture) == pytest.approx(
             float(np.ravel(compared.values[name])[0]), rel=1e-9
         )
+
+
+@pytest.mark.parametrize("axis", ["image", "sensor"])
+def test_metrics_follow_the_gaze(camera, scene, axis):
+    """Camera and comparison agree for a gaze, behind a fixed lens and for a camera that turns."""
+    away = camera.at((8.0, -4.0), axis)
+    pair = fs.compare.cameras({"one": away, "other": away}, {"blocks": scene}, exposure_s=0.01, max_pixels=64)
+    capture = away.capture(scene, exposure_s=0.01, seed=0)
+    for name in SAME:
+        value = number_of(name, ComparedShot(scene, away, 0.01), away, capture)
+        assert value == pytest.approx(float(np.ravel(pair.values[name])[0]), rel=1e-9), name
 
 
 def test_further_metrics_are_by_annulus(camera, scene, compared):
@@ -63,6 +78,7 @@ def test_further_metrics_are_by_annulus(camera, scene, compared):
     assert compared.values["n_sites_by_eccentricity"][0].sum() == camera.layout.n_sites
     assert np.isnan(compared.values["exposure_s_by_eccentricity"]).all()
     assert "signal-to-noise ratio" in str(compared)
+    assert best_cameras(("mean_code_dn",), compared.summary) == [None]  # neither direction is better
     assert {"snr", "n_sites", "n_sites_by_eccentricity"} <= set(compared.to_xarray().variables)
 
 

@@ -29,6 +29,7 @@ def ideal_picture(shot: MetricShot, camera: Camera, region: Region | None = None
 @METRICS.register(
     "psnr_db",
     info=MetricInfo(
+        better="high",
         title="PSNR",
         unit="dB",
         definition="peak signal-to-noise ratio of the picture, with the range of the ideal picture as peak",
@@ -50,7 +51,10 @@ def picture_psnr_db(
 @METRICS.register(
     "ssim",
     info=MetricInfo(
-        title="SSIM", definition="structural similarity of the picture and the ideal picture", reference=ideal_picture
+        better="high",
+        title="SSIM",
+        definition="structural similarity of the picture and the ideal picture",
+        reference=ideal_picture,
     ),
 )
 def picture_ssim(

@@ -101,7 +101,9 @@ def finite_median(values: Floats) -> float:
     return float(np.median(known)) if known.size else float("nan")
 
 
-@METRICS.register("mtf", info=MetricInfo(title="MTF of lens and photosite"), example={"frequency_per_mm": 50.0})
+@METRICS.register(
+    "mtf", info=MetricInfo(better="high", title="MTF of lens and photosite"), example={"frequency_per_mm": 50.0}
+)
 def mtf(
     shot: MetricShot, camera: Camera, capture: Capture, *, frequency_per_mm: float, sites: Ints | None = None
 ) -> float:
@@ -120,6 +122,7 @@ def mtf(
 @METRICS.register(
     "nyquist_per_mm",
     info=MetricInfo(
+        better="high",
         title="Nyquist frequency",
         unit="1/mm",
         definition="median over the sites, from the spacing of their rows",
@@ -141,6 +144,7 @@ def median_nyquist_per_mm(
 @METRICS.register(
     "mtf50_per_mm",
     info=MetricInfo(
+        better="high",
         title="MTF50",
         unit="1/mm",
         definition="frequency at which the product of optics and aperture MTF is one half",

@@ -20,7 +20,9 @@ def signal_to_noise_of(shot: MetricShot, camera: Camera, capture: Capture) -> Fl
     return signal_to_noise(sensor, capture.expected_e, dark_e, exposure_s=shot.exposure_s).unsaturated_ratio
 
 
-@METRICS.register("snr", info=MetricInfo(title="signal-to-noise ratio", headline="median", jumps_to_zero=True))
+@METRICS.register(
+    "snr", info=MetricInfo(better="high", title="signal-to-noise ratio", headline="median", jumps_to_zero=True)
+)
 def snr(shot: MetricShot, camera: Camera, capture: Capture, sites: Ints | None = None) -> dict[str, float]:
     """
     Compute the mean and median signal-to-noise ratio of the sites analytically.
@@ -32,7 +34,7 @@ def snr(shot: MetricShot, camera: Camera, capture: Capture, sites: Ints | None =
     return {"mean": float(ratio.mean()), "median": float(np.median(ratio))}
 
 
-@METRICS.register("snr_db", info=MetricInfo(title="signal-to-noise ratio", unit="dB"))
+@METRICS.register("snr_db", info=MetricInfo(better="high", title="signal-to-noise ratio", unit="dB"))
 def snr_db(shot: MetricShot, camera: Camera, capture: Capture, sites: Ints | None = None) -> float:
     """Return the median signal-to-noise ratio, dB."""
     return _db(snr(shot, camera, capture, sites)["median"])
@@ -41,6 +43,7 @@ def snr_db(shot: MetricShot, camera: Camera, capture: Capture, sites: Ints | Non
 @METRICS.register(
     "snr_mean_db",
     info=MetricInfo(
+        better="high",
         title="SNR per site",
         unit="dB",
         definition="signal-to-noise ratio of a site, 0 if it is saturated, mean over the sites, 20 log₁₀",

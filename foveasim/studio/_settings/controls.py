@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
-from foveasim._core.validation import UNIT_SUFFIXES
+from foveasim._core.validation import words_and_unit
 from foveasim.config import bundled_layouts, get_setting, schema
 from foveasim.studio._settings.labels import words_of
 from foveasim.studio._settings.templates import INITIAL, PER_AREA, has_mosaic, templates
@@ -268,14 +268,13 @@ def _templates_of(root: dict[str, Any], items: Sequence[dict[str, Any]]) -> list
 def _described(key: str, section: str, node: dict[str, Any]) -> dict[str, Any]:
     """Return the name, unit and help of a control."""
     name = key.rpartition(".")[2]
-    suffix = next((s for s in UNIT_SUFFIXES if name.endswith(s) and len(s) < len(name)), "")
-    label = name.removesuffix(suffix).replace("_", " ") if UNIT_SUFFIXES.get(suffix) else name.replace("_", " ")
+    label, unit = words_and_unit(name)
     words = words_of(key)
     found = _sentence(_plain(node.get("description", "")))
     return {
         "key": key,
         "label": words.label or label,
-        "unit": words.unit or UNIT_SUFFIXES.get(suffix, "") or ("fraction" if suffix == "_fraction" else ""),
+        "unit": words.unit or unit or ("fraction" if name.endswith("_fraction") else ""),
         "section": section,
         "help": words.help or found or f"{(words.label or label).capitalize()}.",
         "synonyms": words.synonyms,
