@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from browsers import wait_for_promise
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
@@ -64,7 +65,7 @@ def test_pages_have_no_serious_violations(browser, tmp_path, make):
     context = browser.new_context(reduced_motion="reduce")
     page = context.new_page()
     page.goto(path.as_uri())
-    page.evaluate("globalThis.foveasim?.complete")
+    wait_for_promise(page, "globalThis.foveasim?.complete")
     if page.locator("#select").count():
         page.keyboard.press("s")
         page.evaluate("() => { document.getElementById('notice').hidden = true; }")

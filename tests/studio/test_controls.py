@@ -156,7 +156,8 @@ def test_sections_start_without_an_error(demo, controls):
             built.add(choice["label"])
 
     for registry in (LAYOUTS, EDITS, SCENES, LENSES, EFFECTS, PUPILS, CURVES, PIXEL_OPTICS):
-        missing = {name for name in registry if name.replace("_", " ") not in built}
+        bundled = registry.within("foveasim")  # other tests register objects that need arrays
+        missing = {name for name in bundled if name.replace("_", " ") not in built}
         at_points = {name for name in missing if registry[name].__module__.endswith(".at_points")}
         assert missing - at_points <= {"cube", "file", "picture", "image"}, registry.kind  # of files
 

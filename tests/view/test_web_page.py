@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import shapely
 import shapely.affinity
-from browsers import watch
+from browsers import wait_for_promise, watch
 from matplotlib import colormaps
 from reference.ray_casting import first_hits, rays_of
 from waiting import wait_until
@@ -256,7 +256,7 @@ def visit(browser, tmp_path):
         watch(page, problems)
         page.on("request", lambda request: requested.append(request.url))
         page.goto(path.as_uri() + hash_text)
-        page.evaluate("foveasim.complete")
+        wait_for_promise(page, "foveasim.complete")
         return page
 
     yield open_page

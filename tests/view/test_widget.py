@@ -8,7 +8,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from browsers import watch
+from browsers import wait_for_promise, watch
 from waiting import wait_until
 
 import foveasim as fs
@@ -92,7 +92,7 @@ def show(browser):
         state["selected"] = list(state["selected"])
         page.evaluate(OPEN, [base64.b64encode(widget._esm.encode()).decode(), state])
         (frame,) = page.main_frame.child_frames
-        frame.evaluate("foveasim.complete")
+        wait_for_promise(frame, "foveasim.complete")
         widget.observe(send, ["by", "pinned", "selected", "height_px"])
         return page, frame
 
