@@ -54,6 +54,7 @@ MODULES = {
     "foveasim.sensor": "Quantum efficiency, colour filters, the electronic chain, noise budget, calibration, HDR merge.",
     "foveasim.sensor.effects": "Noise sources, fixed patterns and crosstalk, and the interface of user effects.",
     "foveasim.reconstruct": "Raster pictures from captures.",
+    "foveasim.columns": "Columns of photosites: what tables, figures, pages and exports show of a capture.",
     "foveasim.tiles": "Captures of sensors that are larger than memory.",
     "foveasim.video": "Frames from files, gaze paths, recordings.",
     "foveasim.modes": "Rolling shutters, event pixels, integrate-and-fire pixels.",

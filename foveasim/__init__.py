@@ -73,6 +73,7 @@ __all__ = [
     "Sensor",
     "SiliconQE",
     "__version__",
+    "columns",
     "compare",
     "compile_kernels",
     "config",

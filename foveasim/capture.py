@@ -22,6 +22,7 @@ from foveasim._core.validation import Floats, Ints, check_count, own, read_only,
 from foveasim._io.atomic import atomic_directory
 from foveasim._io.npz import open_archive, write_archive
 from foveasim._io.zarr_stores import ZARR, Variable, free_name, open_store, store_format, write_variables
+from foveasim.columns import COLUMNS, STORED, column_info, compute_column
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout.model import Layout
@@ -58,10 +59,6 @@ FILE_VERSION = 1
 #: Functions of :mod:`foveasim.reconstruct`, and the values that they reconstruct.
 Method = Literal["cells", "linear", "natural", "least_squares"]
 Quantity = Literal["code", "electrons", "expected_e", "light_e"]
-#: Arrays of a capture file, in addition to those of the layout.
-ARRAYS = ("code", "electrons", "expected_e", "filter_of_site")
-#: Units of variables whose names do not end in one.
-UNITS = {"code": "DN", "electrons": "e-"}
 #: Names of variables that are derived from the layout, and of the dimensions' coordinates.
 DERIVED = ("x_um", "y_um", "area_um2", "filter_name")
 SITE, FILTER = "site", "filter"
@@ -128,15 +125,15 @@ class Capture:
     def __post_init__(self) -> None:
         n_filters = len(self.filter_names)
         max_code = 2 ** check_count("bits", self.bits, at_least=1, at_most=16) - 1
-        for name, shape, kinds, limit in (
-            ("code", (self.layout.n_sites,), "u", max_code),
-            ("electrons", (self.layout.n_sites,), "i", None),
-            ("expected_e", (self.layout.n_sites,), "f", None),
-            ("filter_of_site", (self.layout.n_sites,), "i", n_filters - 1),
-            ("white_dn", (n_filters,), "f", None),
-        ):
+        limits = {"code": max_code, "filter_of_site": n_filters - 1}
+        shapes = {
+            **{name: (self.layout.n_sites, info.dtype) for name, info in STORED.items()},
+            "white_dn": (n_filters, "f8"),
+        }
+        for name, (n, dtype) in shapes.items():
+            shape, limit = (n,), limits.get(name)
             values = np.asarray(unmasked(name, getattr(self, name)))
-            if values.shape != shape or values.dtype.kind not in kinds:
+            if values.shape != shape or values.dtype.kind != dtype[0]:
                 raise ParameterError(
                     name, f"must be numbers of the shape {shape}, got {values.dtype} of {values.shape}"
                 )
@@ -157,6 +154,47 @@ class Capture:
         return (
             f"Capture({self.layout.n_sites} sites, {self.bits} bits, {100 * self.saturated_fraction:.1f} % saturated)"
         )
+
+    def column(self, name: str, *, sensor: Sensor | None = None) -> NDArray[Any]:
+        """
+        Return a column of the photosites.
+
+        Parameters
+        ----------
+        name : str
+            An array of the capture, a column of the layout, or a column in :data:`foveasim.columns.COLUMNS`, such as
+            ``"snr"``.
+        sensor : Sensor, optional
+            As for :meth:`picture`.
+
+        Returns
+        -------
+        values : (n_site,) array
+
+        Raises
+        ------
+        ParameterError
+            When the column does not exist, or requires parameters of the sensor that are not known.
+        SimulationError
+            When the function of the column does not return one value per site.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision")
+        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+        >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+        >>> capture = camera.capture(scene, exposure_s="auto", seed=0)
+        >>> capture.column("snr").shape, capture.column("expected_dn").dtype
+        ((256,), dtype('float64'))
+        """
+        self._check_sensor(sensor)
+        if name not in STORED and name in self.layout.columns:
+            return self.layout.columns[name]
+        if name not in COLUMNS:
+            known = sorted({*COLUMNS, *self.layout.columns})
+            raise ParameterError("name", "must be the name of a column", name, hint=possible_names(name, known))
+        return compute_column(name, self, sensor)
 
     @property
     def saturated_fraction(self) -> float:
@@ -372,13 +410,30 @@ class Capture:
         -------
         ratio : (n_site,) float64
         """
-        self._check_sensor(sensor)
-        known = self._electronics if sensor is None else sensor
+        known = self._sensor_or(sensor)
         exposure_s = float(self.settings.get("exposure_s", 0.0))
         dark_e = np.broadcast_to(
             known.expected_electrons(np.zeros(self.layout.n_sites), exposure_s), self.expected_e.shape
         )
         return signal_to_noise(known, self.expected_e, dark_e, exposure_s=exposure_s).ratio
+
+    def expected_code(self, *, sensor: Sensor | None = None) -> Floats:
+        """
+        Return the mean code of every site over temporal noise.
+
+        See :meth:`foveasim.Sensor.predict`.
+
+        Parameters
+        ----------
+        sensor : Sensor, optional
+            As for :meth:`picture`.
+
+        Returns
+        -------
+        mean_dn : (n_site,) float64, DN
+        """
+        exposure_s = float(self.settings.get("exposure_s", 0.0))
+        return self._sensor_or(sensor).predict(self.expected_e, exposure_s=exposure_s)[0]
 
     def _check_sensor(self, sensor: Sensor | None) -> None:
         """Raise when a sensor has another layout than the capture."""
@@ -399,7 +454,7 @@ class Capture:
         values = np.asarray(self.code if of == "light_e" else getattr(self, of), dtype=np.float64)
         if not is_estimated and per != "um2":
             return values, np.ones(values.size), None
-        electronics = self._electronics if sensor is None else sensor
+        electronics = self._sensor_or(sensor)
         e_per_dn = electrons_per_code(electronics) if of == "code" else np.ones(values.size)
         light_response = electronics.light_response(is_device_known=False)
         response = self.layout.area_um2 * light_response * (np.mean(e_per_dn) / e_per_dn)
@@ -414,6 +469,11 @@ class Capture:
         if is_fitted:
             values[estimates.is_saturated] = np.nan
         return values, response, estimates.variance_e2 / e_per_dn**2
+
+    def _sensor_or(self, given: Sensor | None) -> Sensor:
+        """Return a given sensor of this layout, or that of the capture; see :meth:`picture`."""
+        self._check_sensor(given)
+        return self._electronics if given is None else given
 
     @cached_property
     def _electronics(self) -> Sensor:
@@ -444,9 +504,9 @@ class Capture:
         -------
         xarray.Dataset
             Dimensions ``site`` (n_site) and ``filter`` (n_filter). Variables ``code``, ``electrons``, ``expected_e``,
-            ``filter_of_site`` over sites, ``white_dn`` over filters. Coordinates: index of the sites, their centroids
-            ``x_um`` and ``y_um``, ``area_um2``, names of the filters, and all columns of the layout. Every variable has
-            its ``units``, ``"1"`` when dimensionless. Attributes: ``bits``, ``seed``, ``exposure_s``, and
+            ``filter_of_site`` and registered columns over sites, ``white_dn`` over filters. Coordinates: index of the sites,
+            their centroids ``x_um`` and ``y_um``, ``area_um2``, names of the filters, and all columns of the layout. Every
+            variable has its ``units``, ``"1"`` when dimensionless. Attributes: ``bits``, ``seed``, ``exposure_s``, and
             ``settings``, ``versions``, ``provenance`` as JSON strings.
 
         Notes
@@ -471,8 +531,8 @@ class Capture:
         -------
         pandas.DataFrame
             Index ``site``. Columns ``x_um``, ``y_um``, ``area_um2``, ``filter_name``, ``filter_of_site``, ``code``,
-            ``electrons``, ``expected_e``, and the columns of the layout, named as in :meth:`to_xarray`. ``attrs`` contains the
-            attributes of :meth:`to_xarray`.
+            ``electrons``, ``expected_e``, registered columns, and those of the layout, named as in :meth:`to_xarray`.
+            ``attrs`` contains the attributes of :meth:`to_xarray`.
 
         Examples
         --------
@@ -485,7 +545,8 @@ class Capture:
         columns = {
             **{name: coordinates[name] for name in ("x_um", "y_um", "area_um2")},
             "filter_name": Variable((SITE,), np.array(self.filter_names)[self.filter_of_site], {}),
-            **{name: variables[name] for name in ("filter_of_site", "code", "electrons", "expected_e")},
+            "filter_of_site": variables["filter_of_site"],
+            **{name: part for name, part in variables.items() if part.dims == (SITE,)},
             **{name: part for name, part in coordinates.items() if part.dims == (SITE,) and name != SITE},
         }
         # DataFrames share memory with their arrays, which are read-only here.
@@ -499,7 +560,11 @@ class Capture:
     def _variables(self) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, str]]:
         """Return variables, coordinates, and the names of the layout's columns among these."""
         layout, centroid_um = self.layout, self.layout.centroid_um
-        variables = {name: _variable(name, (SITE,), np.asarray(getattr(self, name))) for name in ARRAYS}
+        variables = {
+            name: _variable(name, (SITE,), compute_column(name, self))
+            for name in COLUMNS
+            if column_info(name).in_tables
+        }
         variables["white_dn"] = _variable("white_dn", (FILTER,), np.asarray(self.white_dn))
         coordinates = {
             SITE: _variable(SITE, (SITE,), np.arange(layout.n_sites)),
@@ -560,7 +625,7 @@ class Capture:
             "sensor_arrays": list(self._stored_arrays),
             "provenance": to_plain_data(dict(self.layout.provenance)),
         }
-        arrays = {name: getattr(self, name) for name in ARRAYS}
+        arrays = {name: getattr(self, name) for name in STORED}
         of_sensor = {f"{SENSOR_GROUP}_{k}": values for k, values in enumerate(self._stored_arrays.values())}
         write_archive(path, about, arrays | of_sensor | layout_to_arrays(self.layout))
 
@@ -617,7 +682,7 @@ class Capture:
         if source.is_dir() or (source.suffix.lower() == ZARR and not source.exists()):
             return cls._load_store(source)
         with open_archive(source, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
-            values: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
+            values: dict[str, Any] = {name: arrays[name] for name in STORED}
             return cls(
                 layout=layout_from_arrays(arrays, about["provenance"]),
                 **values,
@@ -640,7 +705,7 @@ class Capture:
             columns = {str(name): arrays[path][...] for name, path in about["columns"].items()}
             return cls(
                 layout=Layout(xy_um, ring_offsets, site_offsets, columns, json.loads(about["provenance"])),
-                **{name: arrays[name][...] for name in (*ARRAYS, "white_dn")},
+                **{name: arrays[name][...] for name in (*STORED, "white_dn")},
                 filter_names=tuple(map(str, about["filter_names"])),
                 bits=about["bits"],
                 settings=json.loads(about["settings"]),
@@ -654,7 +719,8 @@ class Capture:
 
 def _variable(name: str, dims: tuple[str, ...], values: NDArray[Any], *, is_renamed: bool = False) -> Variable:
     """Return an array with the unit in its name; xarray writes the unit of times itself."""
-    units = {} if values.dtype.kind in "mM" else {"units": UNITS.get(name) or unit_of(name) or "1"}
+    unit = column_info(name).unit if name in COLUMNS else unit_of(name)
+    units = {} if values.dtype.kind in "mM" else {"units": unit or "1"}
     return Variable(dims, values, units | ({"long_name": name} if is_renamed else {}))
 
 

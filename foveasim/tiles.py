@@ -43,6 +43,7 @@ from foveasim.camera._footprints import find_footprints, placed
 from foveasim.camera._steps import WeightedMap, capture_settings, expose, integrate_maps, white_dn
 from foveasim.camera._warnings import Covered, warn_of_coarse_cells, warn_of_coverage, warn_of_focal_length
 from foveasim.capture import Capture
+from foveasim.columns import COLUMNS, STORED, column_info
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator, outline_bounds_um
@@ -62,8 +63,9 @@ FORMAT, VERSION = "foveasim tiles", 1
 TILE_SITES = 1 << 22
 #: Rows of the map around a tile: gradients of second-order integration need one, rounding of the bounds another.
 MARGIN_ROWS = 2
-#: Arrays of a tile and their types; the last array of a store marks complete tiles.
-ARRAYS: dict[str, str | None] = {"expected_e": "f8", "electrons": "i8", "code": None}
+#: Arrays of a tile that its capture has as attributes; the filter of a site follows from the layout. The last array of a store
+#: marks complete tiles.
+ARRAYS = tuple(name for name in STORED if name != "filter_of_site")
 COMPLETE = "tile_is_complete"
 LAYOUT, SENSOR = "layout", "sensor"
 CODECS = ("bytes", "zstd")
@@ -264,8 +266,9 @@ class TiledCapture:
 
     Attributes
     ----------
-    code, electrons, expected_e : zarr array (n_site,)
-        As those of :class:`foveasim.Capture`: ``capture.code[first:last]`` reads the chunks of these sites only.
+    columns : mapping of str to zarr array (n_site,)
+        Columns of the photosites, as those of :class:`foveasim.Capture`, with the registered ones that tables contain:
+        ``capture.columns["code"][first:last]``, in short ``capture.code[first:last]``, reads the chunks of these sites only.
     tile_sites : int
         Sites per tile and per chunk.
     filter_names : tuple of str
@@ -275,9 +278,7 @@ class TiledCapture:
     path : Path
     """
 
-    code: Any
-    electrons: Any
-    expected_e: Any
+    columns: Mapping[str, Any]
     tile_sites: int
     filter_names: tuple[str, ...]
     bits: int
@@ -287,6 +288,21 @@ class TiledCapture:
 
     def __repr__(self) -> str:
         return f"TiledCapture({self.n_sites:,} sites in {self.n_tiles} tiles, {self.bits} bits, {self.path.name!r})"
+
+    @property
+    def code(self) -> Any:
+        """Digital values, zarr array (n_site,) uint8 or uint16, DN."""
+        return self.columns["code"]
+
+    @property
+    def electrons(self) -> Any:
+        """Collected charge, zarr array (n_site,) int64, e-."""
+        return self.columns["electrons"]
+
+    @property
+    def expected_e(self) -> Any:
+        """Expected charge, zarr array (n_site,) float64, e-."""
+        return self.columns["expected_e"]
 
     @property
     def n_sites(self) -> int:
@@ -339,7 +355,7 @@ class TiledCapture:
             return Capture(
                 layout=layout,
                 electronics=sensor,
-                **{name: getattr(self, name)[first:last] for name in ARRAYS},
+                **{name: self.columns[name][first:last] for name in ARRAYS},
                 filter_of_site=layout.channel.astype(np.min_scalar_type(-len(self.filter_names)))
                 if len(self.filter_names) > 1
                 else np.zeros(layout.n_sites, np.int8),
@@ -454,7 +470,7 @@ def write_tiles(
             tiles = with_progress(tiles, "tiles", -(-layout.n_sites // plan["tile_sites"]), n_complete)
         try:
             with _open(directory, "r+", is_finished=False) as group:
-                arrays = {name: group[name] for name in (*ARRAYS, COMPLETE)}
+                arrays = {name: group[name].with_config(ALL_CHUNKS) for name in (*_names(group), COMPLETE)}
             for capture in tiles:
                 with disk_errors(target):
                     _add(arrays, n_complete, capture)
@@ -498,7 +514,7 @@ def read_tiles(path: str | Path) -> TiledCapture:
     with _open(source) as group:
         about = dict(group.attrs)
         return TiledCapture(
-            **{name: group[name] for name in ARRAYS},
+            columns={name: group[name] for name in _names(group)},
             tile_sites=int(about["plan"]["tile_sites"]),
             filter_names=tuple(about["filter_names"]),
             bits=int(about["bits"]),
@@ -539,15 +555,16 @@ def _create(directory: Path, camera: Camera, light: Scene | PowerMap, plan: Mapp
         "white_dn": white_dn(sensor, light).tolist(),
         "provenance": to_plain_data(dict(layout.provenance)),
         "plan": plan,
+        "columns": [name for name in COLUMNS if name not in STORED and column_info(name).in_tables],
     }
     group = import_optional(directory, "zarr").create_group(str(directory), zarr_format=3, attributes=attributes)
     n_sites, tile_sites = layout.n_sites, plan["tile_sites"]
-    for name, dtype in ARRAYS.items():
+    for name in _names(group):
         group.create_array(
             name,
             shape=(n_sites,),
             chunks=(tile_sites,),
-            dtype=dtype or ("u1" if sensor.bits <= 8 else "u2"),
+            dtype="u1" if name == "code" and sensor.bits <= 8 else column_info(name).dtype,
             dimension_names=("site",),
             config=ALL_CHUNKS,
         )
@@ -565,16 +582,21 @@ def _create(directory: Path, camera: Camera, light: Scene | PowerMap, plan: Mapp
 def _add(arrays: Mapping[str, Any], tile: int, capture: Capture) -> None:
     """Write a tile; its mark is written last."""
     first = capture.settings["tile"]["first_site"]
-    for name in ARRAYS:
-        arrays[name][first : first + capture.layout.n_sites] = getattr(capture, name)
+    for name in arrays.keys() - {COMPLETE}:
+        arrays[name][first : first + capture.layout.n_sites] = capture.column(name)
     arrays[COMPLETE][tile] = 1
+
+
+def _names(group: Any) -> tuple[str, ...]:
+    """Return the names of the columns that were registered when a store was created."""
+    return (*ARRAYS, *map(str, group.attrs.get("columns", ())))
 
 
 @contextmanager
 def _open(source: Path, mode: str = "r", *, is_finished: bool = True) -> Iterator[Any]:
     """Open the group of an untrusted store; exceptions of the block become FileErrors."""
     with open_group(source, "tiled capture", CODECS, FORMAT, VERSION, mode) as group:
-        arrays = {name: group[name] for name in ARRAYS} if is_finished else {}
+        arrays = {name: group[name] for name in _names(group)} if is_finished else {}
         parts = [part for part in (LAYOUT, SENSOR) if part in group]
         arrays |= {f"{part}/{name}": array for part in parts for name, array in group[part].arrays()}
         for name, array in arrays.items():

@@ -36,6 +36,7 @@ FLOORS = {
             "layout.adjacency", "layout.gaps", "layout.graph", "layout.packed",
         },
         {"modes", "reconstruct"},
+        {"columns"},
         {"capture"},
         {"camera"},
     ],

@@ -52,7 +52,7 @@ again = fs.Capture.load("capture.npz")
 open("two.lines", "w").write("LINES\\n1 2\\n3 4\\n")
 cube = fs.Scene.from_cube("two.lines", distance_m=1.0)
 names = {"daisy", "stretch_x", "min_roundness", "boxes", "pad", "powers", "lines", "supply_ripple", "binary_gates", "baffle", "comb", "half_plane",
-         "half_moon", "magnifier", "darkest_code_dn", "spot"}
+         "half_moon", "magnifier", "darkest_code_dn", "spot", "charge_density"}
 own = [found for found in extensions() if found[1] in names]
 for kind, name in own:
     check_extension(kind, name)
@@ -77,6 +77,7 @@ uses = {
     "comparison": compared.values[name][0, 0] == capture.code.min() and "lowest code" in open("report.html").read().lower(),
     "studio": {"name": name, "label": "lowest code / DN", "unit": "DN", "has_region": True, "is_cost": False} in rows["measures"],
     "schema": name in json.dumps(fs.explore.schema_of("sweep")),
+    "column": "charge_density" in capture.to_pandas() and "charge_density" in json.dumps(fs.explore.schema_of("dataset")),
 }
 print(json.dumps({
     "uses": sorted(use for use, is_right in uses.items() if is_right),
@@ -116,6 +117,7 @@ def test_installed_package_extends_every_kind(extended):
     assert extended.returncode == 0, extended.stderr
     assert json.loads(extended.stdout) == {
         "uses": [
+            "column",
             "comparison",
             "generator in the studio",
             "goal seek",

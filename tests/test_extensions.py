@@ -12,6 +12,7 @@ import shapely
 from registries import restored
 
 import foveasim as fs
+from foveasim.columns import COLUMNS
 from foveasim.distortion import LENSES
 from foveasim.errors import ParameterError
 from foveasim.layout import DERIVED_LAYERS, EDITS, FORMATS, LAYOUTS, RULES, FileFormat, LayoutLayer, Rule, layout_family
@@ -26,7 +27,7 @@ from foveasim.testing import check_all, check_extension, extensions
 
 REGISTRIES = (
     LAYOUTS, EDITS, RULES, FORMATS, DERIVED_LAYERS, MAP_FORMATS, CUBE_FORMATS, EFFECTS, PIXEL_OPTICS, CURVES, SCENES, PUPILS, LENSES,
-    METRICS, PSF_FORMATS,
+    METRICS, PSF_FORMATS, COLUMNS,
 )  # fmt: skip
 NUMBERS = count()
 #: Kinds whose files are read in several new processes.
@@ -412,6 +413,18 @@ def as_list(shot, camera, capture):
     return {"codes": None}
 
 
+def of_each_filter(capture):
+    return np.bincount(capture.filter_of_site)
+
+
+def names_of_filters(capture):
+    return np.array(capture.filter_names)[capture.filter_of_site]
+
+
+def changing(capture):
+    return capture.code + float(next(NUMBERS))
+
+
 def brightened(shot, camera, capture):
     code = capture.code
     code.flags.writeable = True
@@ -498,6 +511,9 @@ WRONG = [
     (METRICS, identity, {}, None, "must return the same numbers for a capture that was saved and loaded"),
     (METRICS, as_list, {}, None, "must return a number, a string, or a mapping of names to numbers, got NoneType codes"),
     (METRICS, brightened, {}, None, "must not change the capture|raises ValueError"),
+    (COLUMNS, of_each_filter, {}, None, r"must return one value for each of 16 sites, got the shape \(1,\)"),
+    (COLUMNS, names_of_filters, {}, None, "must return numbers of the dtype float64, got <U"),
+    (COLUMNS, changing, {}, None, "must return the same values for a capture that was saved and loaded"),
 ]  # fmt: skip
 
 

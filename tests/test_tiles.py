@@ -226,6 +226,17 @@ def test_stored_tiles_of_zeros_are_complete(camera, tmp_path):
     np.testing.assert_array_equal(found.code[:], silent.capture(dark, exposure_s=0.01, seed=0).code)
 
 
+def test_tiles_without_light_are_complete(tmp_path):
+    """Chunks of zeros are files, too: a missing one indicates a corrupt store."""
+    layout = fs.layout.grid(n_x=6, n_y=5, pitch_um=4.0)
+    dark = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, capacitance_f=1e-12))
+    scene = fs.Scene.flat(shape=(64, 64), pitch_um=200.0, distance_m=1.0, illuminance_lux=3.0)
+
+    stored = tiles.write_tiles(tmp_path / "dark.zarr", dark, scene, exposure_s=0.001, seed=1)
+
+    assert stored.code[:].tolist() == [0] * 30
+
+
 @pytest.mark.slow
 def test_tiles_of_lateral_colour_equal_capture(camera, scene):
     lens = fs.optics.LateralColour(wavelength_nm=(450.0, 535.0, 620.0), magnification=(1.01, 1.0, 1.005))

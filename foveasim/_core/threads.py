@@ -9,7 +9,8 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from functools import cache
 from threading import RLock
 from typing import Any, TypeVar
@@ -73,6 +74,20 @@ def _renew_locks() -> None:
         lock.renew()
 
 
+#: Number of threads where none is given, in the context of a caller that has its own number.
+_default: ContextVar[int | None] = ContextVar("default_threads", default=None)
+
+
+@contextmanager
+def default_threads(n_threads: int) -> Iterator[None]:
+    """Use a number of threads in all calls of the block that are given none."""
+    token = _default.set(n_threads)
+    try:
+        yield
+    finally:
+        _default.reset(token)
+
+
 def thread_count(n_threads: int | None = None) -> int:
     """
     Return the number of threads to use, by default all cores available to this process.
@@ -81,6 +96,8 @@ def thread_count(n_threads: int | None = None) -> int:
     """
     if n_threads is not None:
         return check_count("n_threads", n_threads, at_most=MAX_THREADS)
+    if (default := _default.get()) is not None:
+        return default
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -98,9 +98,10 @@ def unit_of(name: str) -> str:
 
 def words_and_unit(name: str) -> tuple[str, str]:
     """Return a name in words without the suffix of its unit, and the unit."""
-    suffix = next((s for s in UNIT_SUFFIXES if name.endswith(s) and len(s) < len(name)), "")
+    suffix = next((s for s in UNIT_SUFFIXES if name.lower().endswith(s) and len(s) < len(name)), "")
     unit = UNIT_SUFFIXES.get(suffix, "")
-    return (name.removesuffix(suffix) if unit else name).replace("_", " "), unit
+    bare = name[: len(name) - len(suffix)] if unit else name
+    return bare.replace("_", " ").strip() or name, unit
 
 
 def check_number(

@@ -28,6 +28,7 @@ pupil             parameters                                                    
 PSF format        as layout formats; returns a PSFGrid
 lens model        parameters                                                     mapping of ideal to real points, µm
 metric            parameters after the capture
+column            none
 ================  =============================================================  =========================================
 
 Instead of parameters, the example can be a function of an empty directory that writes files and returns the parameters. A
@@ -54,7 +55,7 @@ from foveasim.testing._extension import Check, Extension
 from foveasim.testing._files import check_cube_format, check_layout_format, check_map_format, check_psf_format
 from foveasim.testing._layouts import check_derived_layer, check_edit, check_family, check_rule
 from foveasim.testing._lenses import check_curve, check_lens, check_pupil
-from foveasim.testing._metrics import check_metric
+from foveasim.testing._metrics import check_column, check_metric
 from foveasim.testing._pixel_optics import check_pixel_optics
 from foveasim.testing._scenes import check_scene
 
@@ -69,6 +70,7 @@ CHECKS: dict[str, Check] = {
         check_family, check_edit, check_rule, check_layout_format, check_derived_layer, check_map_format, check_effect,
         check_pixel_optics,
         check_curve, check_cube_format, check_scene, check_pupil, check_psf_format, check_lens, check_metric,
+        check_column,
     )
 }  # fmt: skip
 

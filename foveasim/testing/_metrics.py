@@ -1,4 +1,4 @@
-"""Check of metrics: numbers that depend on the capture only."""
+"""Checks of metrics and columns: numbers that depend on the capture only."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from foveasim.capture import Capture
+from foveasim.columns import COLUMNS, column_info
 from foveasim.layout import DesignRules
 from foveasim.metrics import METRICS
 from foveasim.scene import Scene
@@ -48,6 +49,26 @@ def check_metric(extension: Extension) -> None:
     capture.save(extension.directory / "capture.npz")
     loaded = Capture.load(extension.directory / "capture.npz")
     require(_is_same(results(loaded), found), "must return the same numbers for a capture that was saved and loaded")
+
+
+@check_of(COLUMNS)
+def check_column(extension: Extension) -> None:
+    """Check the values of a column for a capture, and for the same capture in a file."""
+    shot = shot_with("sensor", {"read_noise_e": 3.0})
+    capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=1)
+    found = np.asarray(extension.item(capture))
+    n_sites, declared = capture.layout.n_sites, np.dtype(column_info(extension.name).dtype)
+    require(
+        found.shape == (n_sites,), f"must return one value for each of {n_sites} sites, got the shape {found.shape}"
+    )
+    is_stored = found.dtype.kind in "biu" or np.can_cast(found.dtype, declared, "same_kind")
+    require(is_stored and declared.kind in "biuf", f"must return numbers of the dtype {declared}, got {found.dtype}")
+    capture.save(extension.directory / "capture.npz")
+    loaded = Capture.load(extension.directory / "capture.npz")
+    require(
+        np.array_equal(extension.item(loaded), found),
+        "must return the same values for a capture that was saved and loaded",
+    )
 
 
 def _is_same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

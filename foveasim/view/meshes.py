@@ -29,6 +29,7 @@ from foveasim._core.validation import (
     unmasked,
 )
 from foveasim.capture import Capture
+from foveasim.columns import COLUMNS, MAIN, column_info
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import Layout
 from foveasim.view.site_colours import SiteColours, colours_of
@@ -45,10 +46,6 @@ DEGENERATE_FRACTION = 1e-12
 MAX_HEIGHT_FRACTION = 0.15
 #: Sites per call of the triangulation.
 SITES_PER_CALL = 20_000
-#: Measured quantities of a capture in its PolyData; the first is active.
-MEASURED = ("code", "electrons", "expected_e", "filter_of_site")
-#: Units of quantities without a suffix.
-UNITS = {"code": "DN", "electrons": "e-"}
 
 Indices = NDArray[np.int32]
 RgbArray = NDArray[np.uint8]
@@ -225,7 +222,7 @@ def prisms(
     ----------
     data : Layout or Capture
     height : str or (n_site,) array
-        Quantity shown by the height: ``"code"``, ``"electrons"``, ``"expected_e"``, ``"area_um2"``, ``"size_um"``, any
+        Quantity shown by the height: ``"code"``, ``"electrons"``, ``"expected_e"``, ``"area_um2"``, ``"size_um"``, any other
         numerical column, or one value per site, at least 0. By default the code of a capture, or the site sizes of a layout.
     by : str or array, optional
         Quantity shown by the colour, as in :func:`foveasim.view.colours_of`; by default that of the height. A colour capture
@@ -258,7 +255,7 @@ def prisms(
     layout = data.layout if isinstance(data, Capture) else data
     if isinstance(data, Capture) and height is None and by is None:
         by = colours_in_picture(data)
-    height = ("code" if is_capture else "size_um") if height is None else unmasked("height", height)
+    height = (MAIN if is_capture else "size_um") if height is None else unmasked("height", height)
     try:
         shown = colours_of(data, height)
     except ParameterError as error:
@@ -295,10 +292,10 @@ def polydata(data: Layout | Capture) -> PolyData:
     -------
     pyvista.PolyData
         One polygon per site in site order, so that arrays over sites are cell data; only a site with a hole is several
-        triangles. Cell data: for a capture ``code`` (the active scalars), ``electrons``, ``expected_e``, ``filter_of_site``;
-        ``site``, the index of the photosite of each cell; ``area_um2`` (the active scalars of a layout), ``channel``,
-        ``readout_line``, and every column. Field data, as JSON: ``units`` by array name, ``provenance``, and for a capture
-        ``settings``.
+        triangles. Cell data: for a capture ``code`` (the active scalars), ``electrons``, ``expected_e``, ``filter_of_site``
+        and registered columns; ``site``, the index of the photosite of each cell; ``area_um2`` (the active scalars of a
+        layout), ``channel``, ``readout_line``, and every column. Field data, as JSON: ``units`` by array name, ``provenance``,
+        and for a capture ``settings``.
 
     Raises
     ------
@@ -320,9 +317,9 @@ def polydata(data: Layout | Capture) -> PolyData:
     columns: dict[str, NDArray[Any]] = {}
     notes: dict[str, Any] = {"provenance": to_plain_data(dict(layout.provenance))}
     if isinstance(data, Capture):
-        columns = {name: getattr(data, name) for name in MEASURED}
+        columns = {name: data.column(name) for name in COLUMNS if column_info(name).in_tables}
         notes["settings"] = data.settings
-    active = next(iter(columns), "area_um2")
+    active = MAIN if columns else "area_um2"
     columns |= {
         "site": np.arange(layout.n_sites, dtype=np.int32),
         "area_um2": layout.area_um2,
@@ -330,7 +327,8 @@ def polydata(data: Layout | Capture) -> PolyData:
         "readout_line": layout.readout_line,
         **layout.columns,
     }
-    notes["units"] = {name: unit for name in columns if (unit := UNITS.get(name) or unit_of(name))}
+    units = {name: column_info(name).unit if name in COLUMNS else unit_of(name) for name in columns}
+    notes["units"] = {name: unit for name, unit in units.items() if unit}
     xy_um, offsets, corners, site = _cells(layout)
     mesh = _polydata(
         np.column_stack((xy_um, np.zeros(xy_um.shape[0]))), offsets.astype(np.int32), corners.astype(np.int32)

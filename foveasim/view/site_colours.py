@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import UNIT_SUFFIXES, Floats, Ints, as_numbers, finite_array, own, unmasked
+from foveasim._core.validation import Floats, Ints, as_numbers, finite_array, own, unmasked, words_and_unit
 from foveasim.capture import Capture
+from foveasim.columns import COLUMNS, MAIN, STORED, column_info
 from foveasim.errors import ParameterError, type_name
 from foveasim.layout import Layout
 from foveasim.reconstruct.picture import NO_DATA_COLOUR
@@ -66,8 +67,8 @@ GREY, VIRIDIS = "gray", "viridis"
 DISPLAY_GAMMA = 1.0 / 2.2
 #: Integers with more distinct values are shown on a scale, and strings without a legend.
 MAX_CATEGORIES = 10
-#: Measured quantities of a capture, with their titles.
-MEASURED = {"code": "code / DN", "electrons": "electrons / e-", "expected_e": "expected charge / e-"}
+#: Columns that every layout has.
+OF_LAYOUT = ("channel", "area_um2", "size_um", "readout_line")
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,9 +194,10 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
     data : Layout or Capture
     by : str or array, optional
         ``"code"``, ``"electrons"``, ``"expected_e"`` of a capture: in grey, or on a colour mosaic in the filter colours.
-        ``"channel"``: the colour of the filter; channels of a layout are R, G, B and W in this order. ``"area_um2"``,
-        ``"size_um"`` (the square root of the area), ``"readout_line"`` or any other column. An array: one value per site, or
-        a colour per site (n_site, 3), uint8 or from 0 to 1. By default the code of a capture, or the bare shapes of a layout.
+        ``"snr"`` and further :data:`~foveasim.columns.COLUMNS` of a capture. ``"channel"``: the colour of the filter; channels
+        of a layout are R, G, B and W in this order. ``"area_um2"``, ``"size_um"`` (the square root of the area),
+        ``"readout_line"`` or any other column. An array: one value per site, or a colour per site (n_site, 3), uint8 or from 0
+        to 1. By default the code of a capture, or the bare shapes of a layout.
     label : str
         Quantity and unit of an array; replaces the title of a named column.
 
@@ -226,35 +228,38 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
         raise ParameterError("data", f"must be a Layout or a Capture, got {type_name(data)}")
     if by is None and capture is None:
         return SiteColours(np.array(SHADES, np.uint8)[_pseudo_random(layout.n_sites, len(SHADES))])
-    by = "code" if by is None else by
+    by = MAIN if by is None else by
     if not isinstance(by, str):
         return _array_colours(by, layout.n_sites, label)
-    if capture is not None and by in MEASURED:
-        return _signal_colours(capture, np.asarray(getattr(capture, by), np.float64), label or MEASURED[by])
-    if by == "channel":
+    if by == "channel" or (by == "filter_of_site" and capture is not None):
         names = _channel_names(layout) if capture is None else capture.filter_names
         return _filters(layout.channel if capture is None else capture.filter_of_site, names, label or "filter")
-    values = _column(layout, by, capture is not None)
-    title = label or title_of(by)
+    values, title = _column(data, by)
+    title = label or title
+    if capture is not None and by in COLUMNS and column_info(by).is_signal:
+        return _signal_colours(capture, np.asarray(values, np.float64), title)
     is_categorical = by == "readout_line" or _is_categorical(values)
     return _categories(values, title) if is_categorical else _continuous(values.astype(np.float64), title, VIRIDIS)
 
 
-def _column(layout: Layout, by: str, is_capture: bool) -> NDArray[Any]:
+def _column(data: Layout | Capture, by: str) -> tuple[NDArray[Any], str]:
+    """Return the values of a column, and its title with the unit."""
+    layout = data.layout if isinstance(data, Capture) else data
+    if isinstance(data, Capture) and by in COLUMNS and (by in STORED or by not in layout.columns):
+        return data.column(by), column_info(by).heading
     if by in layout.columns:
-        return layout.columns[by]
-    if by in {"area_um2", "size_um", "readout_line"}:
+        return layout.columns[by], title_of(by)
+    if by in OF_LAYOUT:
         values: NDArray[Any] = getattr(layout, by)
-        return values
-    known = [*(MEASURED if is_capture else ()), "channel", "area_um2", "size_um", "readout_line", *layout.columns]
-    raise ParameterError("by", "must be a column or an array", by, hint=possible_names(by, sorted(set(known))))
+        return values, title_of(by)
+    known = {*(COLUMNS if isinstance(data, Capture) else ()), *OF_LAYOUT, *layout.columns}
+    raise ParameterError("by", "must be a column or an array", by, hint=possible_names(by, sorted(known)))
 
 
 def title_of(name: str) -> str:
     """Return the title of a column: its name in words and its unit, ``"area / µm²"``."""
-    suffix = next((suffix for suffix in UNIT_SUFFIXES if name.lower().endswith(suffix)), "")
-    bare, unit = name[: len(name) - len(suffix)].replace("_", " "), UNIT_SUFFIXES.get(suffix, "")
-    return f"{bare} / {unit}" if bare and unit else bare or unit
+    words, unit = words_and_unit(name)
+    return f"{words} / {unit}" if unit else words
 
 
 def _array_colours(by: ArrayLike, n_sites: int, label: str) -> SiteColours:

@@ -682,7 +682,7 @@ BAD_DATA_SETS = [
     ({"cameras": 0}, "bad.yaml: 'cameras' must be >= 1, got 0"),
     ({"draws": "many"}, 'bad.yaml: draws: must be a valid integer, got "many"'),
     ({"recipe": "magic"}, "bad.yaml: recipe: must be one of 'classification', 'denoising'"),
-    ({"fields": ["volts"]}, "bad.yaml: fields.0: must be one of 'code'"),
+    ({"fields": ["volts"]}, "bad.yaml: fields.0: must be the name of a column"),
     ({"per_shard": 0}, "bad.yaml: per_shard: must be greater than or equal to 1"),
     ({"set": {"sensor.bitz": 3}}, "bad.yaml: set.sensor.bitz: unknown parameter of Sensor"),
     ({"labels": "none.csv"}, "none.csv: no such file"),

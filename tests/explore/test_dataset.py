@@ -1271,7 +1271,11 @@ def test_invalid_distribution_is_rejected_before_sampling(vary, error, message):
         ({"boxes": [[], [1, 2, 3]]}, ParameterError, r"'boxes\[1\]' must have 2 dimensions"),
         ({"boxes": [[], [[1, 2, 3]]]}, ParameterError, r"must have the shape \(n, 4\)"),
         ({"boxes": [[], [[1, 2, 3, 4, 0.5]]]}, ParameterError, "must have integers up to"),
-        ({"fields": ["codes"]}, ParameterError, "'fields' must be one of 'code'"),
+        (
+            {"fields": ["codes"]},
+            ParameterError,
+            "'fields' must be the name of a column, got 'codes'; did you mean 'code'",
+        ),
         ({"fit": "crop"}, ParameterError, "'fit' must be one of 'cover', 'contain'"),
         ({"cameras": 0}, ParameterError, "'cameras' must be >= 1"),
         ({"draws": 1.5}, ParameterError, "'draws' must be an integer"),

@@ -149,6 +149,6 @@ def public_objects(directory):
         compare.cameras({"a": CAMERA, "b": CAMERA}, {"flat": SCENE}, exposure_s=0.01, n_annuli=2),
         reconstruct.ColourCorrection(np.eye(3), np.zeros(24), np.zeros(24)),
         reconstruct.CorticalImage(data=np.ones((1, 20, 30)), radius_um=np.arange(21.0), start_rad=np.zeros(20)),
-        tiles.TiledCapture(code=MANY, electrons=MANY, expected_e=MANY, tile_sites=500, filter_names=("all",), bits=8, white_dn=np.ones(1), settings={}, path=Path("large.zarr")),
+        tiles.TiledCapture(columns={"code": MANY}, tile_sites=500, filter_names=("all",), bits=8, white_dn=np.ones(1), settings={}, path=Path("large.zarr")),
         dataset, explore.DatasetFile(dataset=dataset, per_shard=None), explore.open_dataset(directory / "samples"),
     ]  # fmt: skip

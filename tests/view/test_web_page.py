@@ -434,7 +434,7 @@ def test_site_colours_follow_selected_column(visit):
     assert row(page, "code") == f"{CAPTURE.code[site]:,} DN"
     assert row(page, "electrons") == f"{CAPTURE.electrons[site]:,} e-"
     assert row(page, "filter") == "G"
-    assert float(row(page, "signal to noise")) == pytest.approx(CAPTURE.signal_to_noise()[site], rel=1e-5)
+    assert float(row(page, "signal-to-noise ratio")) == pytest.approx(CAPTURE.signal_to_noise()[site], rel=1e-5)
     assert page.evaluate(f"foveasim.values({site}).expected_e") == CAPTURE.expected_e[site]
 
 

@@ -10,7 +10,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,9 +19,10 @@ from numpy.typing import NDArray
 from foveasim._core.calls import Limits, OwnCheck
 from foveasim._core.provenance import versions
 from foveasim._core.random_streams import Streams
-from foveasim._core.threads import cached_property
-from foveasim._core.validation import Ints, check_choice, check_count
+from foveasim._core.threads import cached_property, default_threads
+from foveasim._core.validation import Ints, check_count
 from foveasim.capture import Capture
+from foveasim.columns import COLUMNS, STORED, column_info
 from foveasim.config import Shot, Source, build_shot, check_settings, put_setting, resolve_files
 from foveasim.errors import (
     ConfigError,
@@ -55,10 +55,8 @@ from foveasim.explore.worker_cache import rate_settings
 from foveasim.layout import Layout
 from foveasim.scene import Scene
 
-__all__ = ["FIELDS", "Dataset"]
+__all__ = ["Dataset"]
 
-#: Quantities per site that samples may contain.
-FIELDS = ("code", "electrons", "expected_e", "expected_dn")
 #: Number of cached components of each kind per process, the most recently used.
 MAX_CACHED = 4
 #: Largest number of values of each setting that are checked before the first sample.
@@ -96,8 +94,9 @@ class Dataset:
         camera ``i // draws``.
     seed : int
         Seed of the cameras and the noise.
-    fields : sequence of {"code", "electrons", "expected_e", "expected_dn"}
-        Quantities per site in a sample: the code, the electrons, their expectation, and the mean code over temporal noise.
+    fields : sequence of str
+        Columns of the photosites in a sample, by their names in :data:`foveasim.columns.COLUMNS`: the ``"code"``, the
+        ``"electrons"``, their expectation ``"expected_e"``, the mean code over temporal noise, ``"expected_dn"``, and others.
     labels : sequence of int or str, optional
         Class of each picture; by default the class of each pair, or the name of the top-level directory of each picture.
         Strings are numbered in alphabetical order.
@@ -189,7 +188,7 @@ class Dataset:
         self.seed: int = Streams(seed).seed
         self.fields: tuple[str, ...] = tuple(fields)
         for field in self.fields:
-            check_choice("fields", field, FIELDS)
+            COLUMNS.find("fields", field)
         self._n_threads = n_threads
         self._pictures = source_of(pictures)
         n = len(self._pictures)
@@ -474,11 +473,16 @@ class Dataset:
     def _field(self, field: str, index: int, shot: Shot, capture: Capture) -> NDArray[Any]:
         if field == "code":
             return capture.code.astype(self._code_type)
-        if field == "expected_dn":
-            # Equal for all draws of a camera.
-            predict = partial(shot.camera.sensor.predict, capture.expected_e, n_threads=self._n_threads)
-            return np.array(self._cached("prediction", index // self.draws, predict)[0])
-        return np.array(getattr(capture, field))
+
+        def compute() -> NDArray[Any]:
+            with default_threads(self._n_threads):
+                return capture.column(field, sensor=shot.camera.sensor)
+
+        if column_info(field).is_random or field in STORED:
+            return np.array(compute())
+        return np.array(
+            self._cached("columns", (field, index // self.draws), compute)
+        )  # equal for all draws of a camera
 
     def _site_labels(self, index: int, shot: Shot) -> dict[str, Any]:
         picture = self._picture_of(index)

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from foveasim._core.names import did_you_mean
+from foveasim._core.validation import unit_of
 from foveasim.capture import Capture
+from foveasim.columns import COLUMNS, MAIN, column_info
 from foveasim.errors import FoveasimError, ParameterError
 from foveasim.sensor import Sensor
 
@@ -24,8 +26,6 @@ OPTIONS: dict[str, Any] = {
     RASTER: ("method", "max_pixels", "of", "per", "mu", "tolerance", "max_steps"),
     CORTICAL: ("of", "per", "n_rings", "n_sectors", "r_min_um", "r_max_um", "centre_um", "max_pixels"),
 }
-#: Units of the values of sites.
-UNITS = {"code": "DN", "electrons": "e-", "expected_e": "e-", "light_e": "e-"}
 
 
 def check_image_options(name: str, options: Any) -> dict[str, Any] | None:
@@ -94,7 +94,8 @@ def image_attributes(
 def image_units(options: Mapping[str, Any]) -> str:
     """Return the unit of the values of an image."""
     # Least squares estimate photoelectrons.
-    units = "e-" if options.get("method") == "least_squares" else UNITS[options.get("of", "code")]
+    name = "light_e" if options.get("method") == "least_squares" else options.get("of", MAIN)
+    units = column_info(name).unit if name in COLUMNS else unit_of(name)
     return f"{units}/µm²" if options.get("per") == "um2" else units
 
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from foveasim.columns import COLUMNS, column_info
 from foveasim.explore.datasets.images import CORTICAL, RASTER, image_units
 
 __all__ = ["SETTINGS", "Item", "describe_items", "flatten", "unflatten"]
@@ -22,12 +23,9 @@ class Item(NamedTuple):
     units: str = "1"
 
 
-#: Items that are not dimensionless numbers or strings; the units of images follow from their options.
+#: Items that are not dimensionless numbers or strings, except for columns of photosites. The units of images follow from their
+#: options.
 ITEMS = {
-    "code": Item(("site",), "DN"),
-    "electrons": Item(("site",), "e-"),
-    "expected_e": Item(("site",), "e-"),
-    "expected_dn": Item(("site",), "DN"),
     "box_um": Item(("box", "bound"), "µm"),
     "box_label": Item(("box",)),
     "box_covers": Item(("box", "site")),
@@ -63,7 +61,7 @@ def describe_items(sample: Mapping[str, Any], images: Mapping[str, Mapping[str, 
     """
     found = {}
     for name, value in flatten(sample).items():
-        item = ITEMS.get(name, Item())
+        item = Item(("site",), column_info(name).unit or "1") if name in COLUMNS else ITEMS.get(name, Item())
         is_string = isinstance(value, str)
         found[name] = {
             "dimensions": list(item.dimensions),

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from foveasim._core.short_repr import short_repr
 from foveasim._io.yaml_files import read_yaml
+from foveasim.columns import COLUMNS
 from foveasim.config import Source, picture_path, resolve_files, validate
 from foveasim.config._models import Section
+from foveasim.errors import ParameterError
 from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.datasets.images import CORTICAL, RASTER
 from foveasim.explore.datasets.label_files import (
@@ -39,6 +41,21 @@ RECIPES: dict[str | None, Callable[..., Dataset]] = {
 _Numbers = list[float]
 #: Values of sites, and their normalisation.
 _Values = Literal["code", "electrons", "expected_e", "light_e"]
+
+
+def _check_column(name: str) -> str:
+    """Check the name of a column in a file."""
+    try:
+        COLUMNS.find("fields", name)
+    except ParameterError as error:
+        raise ValueError(error.detail) from None
+    return name
+
+
+#: Names of columns, with those of installed packages.
+_ColumnName = Annotated[
+    str, AfterValidator(_check_column), Field(json_schema_extra=lambda schema: schema.update(enum=list(COLUMNS)))
+]
 _Per = Literal["site", "um2"]
 #: Keys with the same name in :class:`Dataset`.
 DATASET_KEYS = ("cameras", "draws", "seed", "fields", "fit")
@@ -115,8 +132,8 @@ class DatasetSection(Section):
     cameras: int | None = Field(None, description="random cameras per picture; 1 by default")
     draws: int | None = Field(None, description="captures per camera; 1 by default, 4 for denoising")
     seed: int = 0
-    fields: list[Literal["code", "electrons", "expected_e", "expected_dn"]] | None = Field(
-        None, description="quantities per site; by default code and electrons, or those of the recipe"
+    fields: list[_ColumnName] | None = Field(
+        None, description="columns of the photosites; by default code and electrons, or those of the recipe"
     )
     fit: Literal["cover", "contain", "width"] | None = Field(
         None, description="framing of the pictures on the layout, instead of that of the scene"

@@ -129,8 +129,8 @@ def plot_capture(
     ----------
     capture : Capture
     by : str or array
-        ``"code"``, ``"electrons"``, ``"expected_e"``, ``"snr"`` (:meth:`Capture.signal_to_noise`), or any value that
-        :func:`plot_layout` accepts.
+        ``"code"``, ``"electrons"``, ``"expected_e"``, ``"snr"`` or another column of the capture
+        (:meth:`Capture.column`), or any value that :func:`plot_layout` accepts.
     label, overlay, scale_bar, legend, ax, figure_inches
         As for :func:`plot_layout`.
 
@@ -154,8 +154,6 @@ def plot_capture(
     >>> axes.get_xlabel()
     'x / µm'
     """
-    if isinstance(by, str) and by == "snr" and by not in capture.layout.columns:
-        by, label = capture.signal_to_noise(), label or "signal-to-noise ratio"
     return _plot(capture.layout, colours_of(capture, by, label=label), overlay, scale_bar, legend, ax, figure_inches)
 
 

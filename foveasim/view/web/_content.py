@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from foveasim._core.quantities import format_quantity
 from foveasim._core.rings import same_rings
-from foveasim._core.validation import UNIT_SUFFIXES
+from foveasim._core.validation import words_and_unit
 from foveasim.capture import Capture
+from foveasim.columns import COLUMNS, MAIN, STORED, ColumnInfo, column_info, compute_column
 from foveasim.errors import GeometryError, ParameterError, SimulationError, type_name
 from foveasim.fields import PowerMap
 from foveasim.layout import Layout, Report
@@ -32,8 +33,6 @@ from foveasim.view.site_pictures import site_picture
 from foveasim.view.web._pack import back_references, to_smallest_type
 from foveasim.view.web._shapes import Shapes, shapes_of
 
-#: Columns of a second capture.
-SECOND = ("picture", "code", "electrons", "expected_e", "snr")
 #: Longer side of the picture.
 PICTURE_PIXELS = 800
 #: Fraction of the cells of an optical image that are not brighter than white.
@@ -174,29 +173,25 @@ def outlines_of(shapes: Shapes) -> dict[str, NDArray[Any]]:
 # -- columns ------------------------------------------------------------------------------------------------------------
 
 
-class _Signal(NamedTuple):
-    """Column of a capture: heading, and a function that returns its values if they exist."""
-
-    key: str
-    label: str
-    unit: str
-    values: Callable[[], NDArray[Any] | None]
-    note: str = ""
-
-
-def _signals(capture: Capture, sensor: Sensor | None) -> list[_Signal]:
-    note = "expected photoelectrons over temporal noise, quantisation included"
-    return [
-        _Signal("electrons", "electrons", "e-", lambda: capture.electrons),
-        _Signal("expected_e", "expected electrons", "e-", lambda: capture.expected_e),
-        _Signal("snr", "signal to noise", "", lambda: _signal_to_noise(capture, sensor), note),
-    ]
+def _signals() -> dict[str, ColumnInfo]:
+    """Return the columns of captures that take time to compute and to send, by key."""
+    infos = {key: column_info(key) for key in COLUMNS if key != MAIN}
+    return {key: info for key, info in infos.items() if info.on_pages}
 
 
 def signals_of(capture: Capture, sensor: Sensor | None) -> dict[str, NDArray[Any]]:
-    """Return the columns of a capture that take time to compute and to send, by key."""
-    found = {signal.key: signal.values() for signal in _signals(capture, sensor)}
+    """Return the values of :func:`_signals`, by key."""
+    found = {key: _signal(capture, key, sensor) for key in _signals()}
     return {key: to_smallest_type(values) for key, values in found.items() if values is not None}
+
+
+def _signal(capture: Capture, key: str, sensor: Sensor | None) -> NDArray[Any] | None:
+    """Return a column of a capture; None if its settings lack what this requires."""
+    try:
+        values = compute_column(key, capture, sensor)
+    except (ParameterError, SimulationError):
+        return None
+    return values.astype(np.float32) if key not in STORED and values.dtype.kind == "f" else values
 
 
 def _columns(
@@ -221,16 +216,18 @@ def _columns(
 
     if capture is not None:
         colours = [_filter_colour(k, name) for k, name in enumerate(capture.filter_names)]
-        code = add("code", "code", "DN", capture.code, "grey")
+        main = column_info(MAIN)
+        code = add(MAIN, main.title, main.unit, capture.code, "grey")
         if len(colours) > 1:
             lit = {**columns[0], "key": "picture", "label": "colour mosaic", "kind": "lit", "colours": colours}
             columns.insert(0, {**lit, "array": code, "is_repeat": True})
-        for key, label, unit, values_of, note in _signals(capture, sensor):
-            more = {"note": note} if note else {}
+        for key, info in _signals().items():
+            more = {"note": info.note} if info.note else {}
             if not has_signals:
-                columns.append({"key": key, "label": label, "unit": unit, "kind": "linear", "is_signal": True, **more})
-            elif (values := values_of()) is not None:
-                add(key, label, unit, values, **more)
+                heading = {"key": key, "label": info.title, "unit": info.unit}
+                columns.append({**heading, "kind": "linear", "is_signal": True, **more})
+            elif (values := _signal(capture, key, sensor)) is not None:
+                add(key, info.title, info.unit, values, **more)
         if len(colours) > 1:
             names = list(capture.filter_names)
             add("channel", "filter", "", capture.filter_of_site, "kinds", names=names, colours=colours)
@@ -244,7 +241,7 @@ def _columns(
     taken = {column["key"] for column in columns}
     for key in sorted(layout.columns, key=lambda name: name != "readout_line"):
         if key not in taken:
-            label, unit = _label(key)
+            label, unit = words_and_unit(key)
             values = layout.columns[key]
             add(key, label, unit, values.astype(str) if _is_categorical(values) and not unit else values)
     return columns
@@ -260,7 +257,8 @@ def _second_columns(layout: Layout, second: Capture, arrays: dict[str, NDArray[A
             f"must be a capture of this layout of {layout.n_sites:,} sites, got one of {second.layout.n_sites:,} sites",
         )
     own: dict[str, NDArray[Any]] = {}
-    measured = [column for column in _columns(layout, second, own) if column["key"] in SECOND]
+    of_capture = {"picture", MAIN, *_signals()}
+    measured = [column for column in _columns(layout, second, own) if column["key"] in of_capture]
     arrays |= {f"second-{column['array']}": own[column["array"]] for column in measured}
     return [
         {
@@ -271,14 +269,6 @@ def _second_columns(layout: Layout, second: Capture, arrays: dict[str, NDArray[A
         }
         for column in measured
     ]
-
-
-def _signal_to_noise(capture: Capture, sensor: Sensor | None) -> NDArray[np.float32] | None:
-    """Return the ratio of every site, (n_site,); None if settings lack the electronics."""
-    try:
-        return capture.signal_to_noise(sensor=sensor).astype(np.float32)
-    except (ParameterError, SimulationError):
-        return None
 
 
 def _is_index(values: NDArray[Any]) -> bool:
@@ -307,12 +297,6 @@ def _as_numbers(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any]]:
     names, kinds = np.unique(values, return_inverse=True)
     strings = [name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name) for name in names]
     return {"names": strings, "is_integer": True}, to_smallest_type(kinds)
-
-
-def _label(key: str) -> tuple[str, str]:
-    """Return the name of a column in words, and the unit in its suffix."""
-    suffix = next((suffix for suffix in UNIT_SUFFIXES if key.lower().endswith(suffix) and len(suffix) < len(key)), "")
-    return key[: len(key) - len(suffix)].replace("_", " ").strip() or key, UNIT_SUFFIXES.get(suffix, "")
 
 
 def _filter_colour(position: int, name: str) -> str:

@@ -10,6 +10,7 @@ import shapely
 from scipy.special import bdtr
 
 import foveasim as fs
+from foveasim.columns import COLUMNS, ColumnInfo
 from foveasim.distortion import LENSES
 from foveasim.layout import DERIVED_LAYERS, FORMATS, RULES, FileFormat, Rule, WrittenLayout, layout_edit, layout_family
 from foveasim.maps import MAP_FORMATS, Found
@@ -258,3 +259,9 @@ class Magnifier:
 def darkest_code_dn(shot, camera, capture, sites=slice(None)):
     """Return the lowest code."""
     return int(capture.code[sites].min())
+
+
+@COLUMNS.register("charge_density", info=ColumnInfo(title="charge density", unit="e-/µm²", is_signal=True))
+def charge_density(capture):
+    """Return the charge of each site over its area, (n_site,) e-/µm²."""
+    return capture.electrons / capture.layout.area_um2
