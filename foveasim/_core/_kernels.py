@@ -14,6 +14,7 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLOATS, FLOATS_2D, INTS
 
 #: Multipliers and Weyl increments of Philox 4x64.
 _M0, _M1 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
@@ -30,8 +31,6 @@ BATCH = 1024
 N_MOMENTS = 6
 _SIXTH, _TWELFTH = 1.0 / 6.0, 1.0 / 12.0
 _QUARTER, _HALF = BATCH // 4, BATCH // 2
-_points = types.Array(types.float64, 2, "C", readonly=True)
-_ints = types.Array(types.int64, 1, "C", readonly=True)
 #: Last words of the counters, so that Gaussian and uniform numbers of a key are independent.
 _NORMALS, _UNIFORMS = np.uint64(0), np.uint64(1)
 #: Lowest bit of the exponent of a float32; bit patterns of 1.0 and sqrt(1/2); mask of the mantissa.
@@ -167,7 +166,7 @@ def fill_uniforms(key, batch, first, second):
         first[j], second[j] = uniform((a << _32) | b), uniform((c << _32) | d)
 
 
-@njit(types.void(types.float64[::1], types.Array(types.float64, 1, "C", readonly=True), types.uint64))
+@njit(types.void(types.float64[::1], FLOATS, types.uint64))
 def add_normals(values, deviation, key):
     """Add Gaussian numbers in place; ``sigma`` has a standard deviation per value, or one."""
     words, normals = np.empty(BATCH, np.uint32), np.empty(BATCH, np.float32)
@@ -183,7 +182,7 @@ def add_normals(values, deviation, key):
                 part[j] += sigma[j] * np.float64(normals[j])
 
 
-@njit(types.void(_points, _ints, types.float64[::1], types.float64[:, ::1]))
+@njit(types.void(FLOATS_2D, INTS, types.float64[::1], types.float64[:, ::1]))
 def ring_moments(xy, ring_offsets, area, moment):
     """
     Store the signed area and the first moments of every ring, (n_ring,) and (n_ring, 2).
@@ -207,7 +206,7 @@ def ring_moments(xy, ring_offsets, area, moment):
         moment[ring, 1] = moment_y / 6.0 + y0 * area[ring]
 
 
-@njit(types.void(_points, _ints, types.float64, types.int8[::1]))
+@njit(types.void(FLOATS_2D, INTS, types.float64, types.int8[::1]))
 def convexity(xy, ring_offsets, min_sine, sign):
     """
     Store the orientation of every strictly convex ring, (n_ring,): 1 or -1.
@@ -270,7 +269,7 @@ def add_outline(xy, start, stop, x_0, y_0, sums):
         x_a, y_a = x_b, y_b
 
 
-@njit(types.void(_points, _ints, _ints, _points, types.float64[:, ::1]))
+@njit(types.void(FLOATS_2D, INTS, INTS, FLOATS_2D, types.float64[:, ::1]))
 def outline_moments(xy, ring_offsets, site_offsets, centre, out):
     """Write the moments of sites, (n, 6), about centres (n, 2)."""
     for s in range(out.shape[0]):
@@ -279,7 +278,7 @@ def outline_moments(xy, ring_offsets, site_offsets, centre, out):
             add_outline(xy, ring_offsets[ring], ring_offsets[ring + 1], centre[s, 0], centre[s, 1], out[s])
 
 
-@njit(types.int64[::1](_points, _ints, _ints, _points, _points))
+@njit(types.int64[::1](FLOATS_2D, INTS, INTS, FLOATS_2D, FLOATS_2D))
 def count_ray_intersections(xy, ring_offsets, site_offsets, centroid, directions):
     """
     Count the rays from each site's centroid that intersect the site's outline.

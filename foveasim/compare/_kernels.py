@@ -8,18 +8,13 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
-
-_ints = types.Array(types.int64, 1, "C", readonly=True)
-_orders = types.Array(types.int64, 2, "C", readonly=True)
-_floats = types.Array(types.float64, 1, "C", readonly=True)
-_points = types.Array(types.float64, 2, "C", readonly=True)
-_tensors = types.Array(types.float64, 3, "C", readonly=True)
+from foveasim._core.jit.types import FLOATS, FLOATS_2D, FLOATS_3D, INTS, INTS_2D
 
 #: Distance, in standard deviations, beyond which a Gaussian is 0: exp(-21) = 7e-10.
 REACH_SIGMAS = 6.5
 
 
-@njit(types.float64[:, ::1](_orders, _points, _points, types.int64))
+@njit(types.float64[:, ::1](INTS_2D, FLOATS_2D, FLOATS_2D, types.int64))
 def ring_sums(ring, y, x, n_rings):
     """
     Sum products y[i, k] x[j, k] over the elements (i, j) of each ring, (n_ring, n_k).
@@ -37,7 +32,7 @@ def ring_sums(ring, y, x, n_rings):
     return out
 
 
-@njit(types.float64[:, ::1](_ints, _points, _tensors, _points, _orders, _points, _floats, _floats))
+@njit(types.float64[:, ::1](INTS, FLOATS_2D, FLOATS_3D, FLOATS_2D, INTS_2D, FLOATS_2D, FLOATS, FLOATS))
 def signal_covariance(members, centre, axes, spread, order, nodes, amplitude, sigma):
     """
     Compute the covariances of the means over sites, (n_member, n_member).

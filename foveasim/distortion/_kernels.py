@@ -6,9 +6,7 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
-
-_points = types.Array(types.float64, 2, "C", readonly=True)
-_numbers = types.Array(types.float64, 1, "C", readonly=True)
+from foveasim._core.jit.types import FLOATS, FLOATS_2D
 
 #: Maximum number of Newton steps, and of halvings per step.
 MAX_STEPS, MAX_HALVINGS = 60, 30
@@ -56,7 +54,7 @@ def _is_inside(x, y, determinant, fold, min_fold):
 
 
 @njit(
-    types.float64[:, ::1](_points, _numbers, types.float64, types.float64, _numbers, _numbers, types.float64),
+    types.float64[:, ::1](FLOATS_2D, FLOATS, types.float64, types.float64, FLOATS, FLOATS, types.float64),
 )
 def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
     """

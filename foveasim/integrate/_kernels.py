@@ -31,6 +31,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLAGS, FLOATS, FLOATS_2D, INTS, array_of
 from foveasim._core.validation import Ints
 
 #: Columns of ``spans``. A finished plan is in the order of the rows and has no column ``ROW``; its first column is the index of
@@ -58,17 +59,8 @@ for _bit in range(64):
     BIT_POSITIONS[(0x03F79D71B4CB0A89 << _bit & (2**64 - 1)) >> 58] = _bit
 
 
-def _input(dtype, ndim):
-    """Return the type of an input array: C-contiguous, read-only or writeable."""
-    return types.Array(dtype, ndim, "C", readonly=True)
-
-
-_ints = _input(types.int64, 1)
-_floats = _input(types.float64, 1)
-_points = _input(types.float64, 2)
-_flags = _input(types.boolean, 1)
-_spans = _input(types.int32, 2)
-_cuts = _input(types.int32, 2)
+_spans = array_of(types.int32, 2)
+_cuts = array_of(types.int32, 2)
 _count = types.int64
 _span_list = types.int32[:, ::1]
 _cut_list = types.int32[:, ::1]
@@ -379,7 +371,7 @@ def _box(uv, start, stop, n_y, n_x):
     return int(np.floor(max(v_low, 0.0))), int(np.ceil(min(v_high, float(n_y)))), left, n_columns
 
 
-@njit(types.Tuple((_float_list, _moment_list))(_points, _ints, _ints))
+@njit(types.Tuple((_float_list, _moment_list))(FLOATS_2D, INTS, INTS))
 def measure_sites(xy, ring_offsets, site_offsets):
     """
     Return the signed area (n_site,) and the bounds (n_site, 4) of every site.
@@ -408,7 +400,7 @@ def measure_sites(xy, ring_offsets, site_offsets):
     return areas, bounds
 
 
-@njit(types.boolean[::1](_points, _ints))
+@njit(types.boolean[::1](FLOATS_2D, INTS))
 def find_reversed_edges(xy, ring_offsets):
     """Return whether the edge after each vertex begins at its lexicographically larger one."""
     is_reversed = np.empty(xy.shape[0], np.bool_)
@@ -420,7 +412,7 @@ def find_reversed_edges(xy, ring_offsets):
     return is_reversed
 
 
-@njit(types.Tuple((_moment_list, _moment_list))(_points, _ints, _flags))
+@njit(types.Tuple((_moment_list, _moment_list))(FLOATS_2D, INTS, FLAGS))
 def edges(xy, ring_offsets, is_reversed):
     """Return the start (n, 2) of the edge after each vertex, and the vector (n, 2) to its end."""
     start, along = np.empty((xy.shape[0], 2)), np.empty((xy.shape[0], 2))
@@ -493,9 +485,9 @@ def accumulators(n_y: int, n_x: int, order: int) -> tuple[NDArray[Any], ...]:
 
 @njit(
     types.void(
-        _points,
-        _ints,
-        _ints,
+        FLOATS_2D,
+        INTS,
+        INTS,
         _count,
         _count,
         _count,
@@ -663,7 +655,7 @@ def trace_sites(
 
 
 @njit(
-    types.void(_spans, _floats, _int_list, _int_list, _ints, _count, _span_list, _float_list),
+    types.void(_spans, FLOATS, _int_list, _int_list, INTS, _count, _span_list, _float_list),
 )
 def sort_spans(spans, weights, next_span, next_weight, first_slot, rows_per_band, out_spans, out_weights):
     """
@@ -691,7 +683,7 @@ def sort_spans(spans, weights, next_span, next_weight, first_slot, rows_per_band
 
 
 @njit(
-    types.void(_cuts, _points, _int_list, _ints, _count, _cut_list, _moment_list),
+    types.void(_cuts, FLOATS_2D, _int_list, INTS, _count, _cut_list, _moment_list),
 )
 def sort_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out_moments):
     """Copy cuts and their moments into row order, as :func:`sort_spans`."""
@@ -766,7 +758,7 @@ def _add_spans(cells, row, spans, first, last, weights, p, where, blocks, slots)
 @njit(
     [
         types.void(
-            _input(cell, 2), _count, _count, _ints, _ints, _spans, _floats, _ints, _cuts, _points, _flags, _float_list
+            array_of(cell, 2), _count, _count, INTS, INTS, _spans, FLOATS, INTS, _cuts, FLOATS_2D, FLAGS, _float_list
         )
         for cell in (types.float32, types.float64)
     ],
@@ -792,7 +784,7 @@ def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, r
 
 
 @njit(
-    types.void(_floats, _count, _count, _ints, _ints, _spans, _floats, _ints, _cuts, _points, _moment_list),
+    types.void(FLOATS, _count, _count, INTS, INTS, _spans, FLOATS, INTS, _cuts, FLOATS_2D, _moment_list),
 )
 def scatter(values, first_row, last_row, row_spans, row_weights, spans, weights, row_cuts, cuts, moments, cells):
     """
@@ -830,7 +822,7 @@ def scatter(values, first_row, last_row, row_spans, row_weights, spans, weights,
 
 @njit(
     [
-        types.void(_input(types.int32, 1), _input(types.int32, 1), _input(real, 1), _input(real, 2), real[:, ::1])
+        types.void(array_of(types.int32), array_of(types.int32), array_of(real), array_of(real, 2), real[:, ::1])
         for real in (types.float32, types.float64)
     ]
 )

@@ -17,22 +17,14 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLAGS, FLOATS_2D, INTS, array_of
 from foveasim.integrate._kernels import ONE, ZERO, _sum_cells
 
 #: Covered fractions of the outermost cells up to this value are rounding errors.
 NO_COVERAGE = 4e-15
 
 
-def _input(dtype, ndim):
-    return types.Array(dtype, ndim, "C", readonly=True)
-
-
-_ints = _input(types.int64, 1)
-_points = _input(types.float64, 2)
-_flags = _input(types.boolean, 1)
-
-
-@njit(types.float64[:, ::1](_points, _ints, _ints))
+@njit(types.float64[:, ::1](FLOATS_2D, INTS, INTS))
 def find_rectangles(xy, ring_offsets, site_offsets):
     """
     Return x_min, y_min, x_max, y_max of every site, (n_site, 4).
@@ -154,7 +146,14 @@ def _integral(cells, u, v, order):
 @njit(
     [
         types.void(
-            _input(cell, 2), _points, types.int64, types.int64, _flags, types.float64, types.int64, types.float64[::1]
+            array_of(cell, 2),
+            FLOATS_2D,
+            types.int64,
+            types.int64,
+            FLAGS,
+            types.float64,
+            types.int64,
+            types.float64[::1],
         )
         for cell in (types.float32, types.float64)
     ],
@@ -177,12 +176,12 @@ def gather_rectangles(cells, bounds, first_site, last_site, where, scale, order,
 @njit(
     [
         types.void(
-            _input(cell, 2),
-            _points,
-            _points,
+            array_of(cell, 2),
+            FLOATS_2D,
+            FLOATS_2D,
             types.int64,
             types.int64,
-            _flags,
+            FLAGS,
             types.float64,
             types.int64,
             types.float64[::1],

@@ -14,15 +14,9 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLOATS_2D, FLOATS_3D, array_of
 from foveasim.integrate._kernels import _gradient_scale
 
-
-def _input(dtype, ndim):
-    return types.Array(dtype, ndim, "C", readonly=True)
-
-
-_points = _input(types.float64, 2)
-_floats3 = _input(types.float64, 3)
 _count = types.int64
 _out3 = types.float64[:, :, ::1]
 _out2 = types.float64[:, ::1]
@@ -81,7 +75,7 @@ def _gradient(cells, i_map, row, column):
 
 @njit(
     [
-        types.void(_input(cell, 3), _count, _points, _points, _count, _count, _count, _out2)
+        types.void(array_of(cell, 3), _count, FLOATS_2D, FLOATS_2D, _count, _count, _count, _out2)
         for cell in (types.float32, types.float64)
     ],
 )
@@ -135,7 +129,7 @@ def measure_moments(cells, i_map, begin, end, first_edge, last_edge, order, out)
         out[edge, 1] = from_b / n_sides
 
 
-@njit(types.void(_floats3, _count, _points, _points, _count, _out3))
+@njit(types.void(FLOATS_3D, _count, FLOATS_2D, FLOATS_2D, _count, _out3))
 def spread_moments(weights, i_map, begin, end, order, cells):
     """Add the adjoint of :func:`measure_moments` for its weights to one of the maps."""
     n_y, n_x = cells.shape[1], cells.shape[2]
@@ -193,7 +187,7 @@ def _value(cells, i_map, row, column, u, v, order):
 
 @njit(
     [
-        types.void(_input(cell, 3), _count, _points, _points, _floats3, _count, _count, _count, _out3)
+        types.void(array_of(cell, 3), _count, FLOATS_2D, FLOATS_2D, FLOATS_3D, _count, _count, _count, _out3)
         for cell in (types.float32, types.float64)
     ],
 )

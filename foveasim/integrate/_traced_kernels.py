@@ -21,6 +21,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLAGS, FLOATS_2D, INTS, array_of
 from foveasim._core.validation import Bools, Ints
 from foveasim.integrate._kernels import (
     BOX_CELLS,
@@ -42,15 +43,6 @@ LINE_CELLS = 16
 PREFETCH_CELLS = 2**16
 #: A sum of cells that does not occur.
 NEVER = 1.2345678e300
-
-
-def _input(dtype, ndim):
-    return types.Array(dtype, ndim, "C", readonly=True)
-
-
-_ints = _input(types.int64, 1)
-_points = _input(types.float64, 2)
-_flags = _input(types.boolean, 1)
 
 
 @njit()
@@ -228,11 +220,11 @@ def _is_within(uv, start, stop, n_y, n_x):
 @njit(
     [
         types.void(
-            _input(cell, 2),
-            _points,
-            _ints,
-            _ints,
-            _flags,
+            array_of(cell, 2),
+            FLOATS_2D,
+            INTS,
+            INTS,
+            FLAGS,
             types.float64,
             types.float64[:, ::1],
             types.float64[:, ::1],

@@ -8,17 +8,15 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLOATS, FLOATS_2D, INTS
 
-_ints = types.Array(types.int64, 1, "C", readonly=True)
-_floats = types.Array(types.float64, 1, "C", readonly=True)
-_points = types.Array(types.float64, 2, "C", readonly=True)
 _flags = types.Array(types.boolean, 1, "C")
 
 #: Length, in µm, up to which edges are those of vertices that differ by rounding, and common edges touch in a corner only.
 MIN_EDGE_UM = 1e-6
 
 
-@njit(types.void(_points, _points, types.int64, types.float64[:, ::1]))
+@njit(types.void(FLOATS_2D, FLOATS_2D, types.int64, types.float64[:, ::1]))
 def fill_rectangles(x, y, first, xy):
     """
     Write the corners of the sites of a lattice from site ``first`` on.
@@ -35,7 +33,7 @@ def fill_rectangles(x, y, first, xy):
         xy[4 * k + 3, 0], xy[4 * k + 3, 1] = x0, y1
 
 
-@njit(types.float64[::1](_points, _ints, _ints, _ints, _points))
+@njit(types.float64[::1](FLOATS_2D, INTS, INTS, INTS, FLOATS_2D))
 def areas_in_boxes(xy, ring_offsets, site_offsets, sites, boxes):
     """
     Return the areas of sites (n,) within boxes (n, 4).
@@ -116,7 +114,7 @@ def _distance_inwards(ax, ay, bx, by, cx, cy, dx, dy):
     return _segment_distance(ax, ay, bx, by, cx, cy, dx, dy)
 
 
-@njit(types.float64[::1](_points, _ints, _ints, types.float64, types.float64, types.float64))
+@njit(types.float64[::1](FLOATS_2D, INTS, INTS, types.float64, types.float64, types.float64))
 def facing_distances(xy, after, first_vertex, side, min_cosine, reach):
     """
     Return the smallest distance of facing edges of each site, at most ``reach``.
@@ -188,7 +186,7 @@ def _next_hull_corner(xy, corner, first, last):
     return best
 
 
-@njit(types.float64[::1](_points, _ints, _ints))
+@njit(types.float64[::1](FLOATS_2D, INTS, INTS))
 def aspect_ratios(xy, ring_offsets, site_offsets):
     """
     Return the aspect ratio of the minimum-area rectangle around each site.
@@ -227,7 +225,7 @@ def aspect_ratios(xy, ring_offsets, site_offsets):
     return ratios
 
 
-@njit(types.int64[::1](_points, _ints))
+@njit(types.int64[::1](FLOATS_2D, INTS))
 def intersecting_boxes(box, order):
     """
     Return the pairs (i, j), i < j, of boxes that intersect or touch, encoded as i n + j.
@@ -274,7 +272,7 @@ def intersecting_boxes(box, order):
     return pairs
 
 
-@njit(types.float64[::1](_points, _ints, _ints))
+@njit(types.float64[::1](FLOATS_2D, INTS, INTS))
 def overhangs(xy, after, first_vertex):
     """Return the extent of a site to the right of each edge line; 0 for convex sites."""
     reach = np.zeros(xy.shape[0])
@@ -420,7 +418,7 @@ def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, nearest,
 
 @njit(
     types.Tuple((types.float64[::1], types.boolean[::1]))(
-        _points, _ints, _ints, _points, _floats, _floats, _ints, _ints, types.float64, types.float64, _flags
+        FLOATS_2D, INTS, INTS, FLOATS_2D, FLOATS, FLOATS, INTS, INTS, types.float64, types.float64, _flags
     ),
 )
 def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach, touching, is_shared):
@@ -468,7 +466,7 @@ def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach
     return distances, is_non_overlapping
 
 
-@njit(types.float64[::1](_points, _ints, _ints, _ints, _ints, types.float64))
+@njit(types.float64[::1](FLOATS_2D, INTS, INTS, INTS, INTS, types.float64))
 def shared_lengths(xy, after, first_vertex, first, second, max_gap):
     """
     Return the length of the common boundary of each pair of sites (first[i], second[i]).
@@ -501,7 +499,7 @@ def shared_lengths(xy, after, first_vertex, first, second, max_gap):
     return lengths
 
 
-@njit(types.void(_points, _ints, _ints, _ints, _ints, _floats, types.float64, types.float64[::1]))
+@njit(types.void(FLOATS_2D, INTS, INTS, INTS, INTS, FLOATS, types.float64, types.float64[::1]))
 def edge_gaps(xy, after, first_vertex, first, second, limit, touching, gap):
     """
     Update the smallest distances of edges to facing edges of another site.
@@ -536,7 +534,7 @@ def edge_gaps(xy, after, first_vertex, first, second, limit, touching, gap):
                     gap[a] = min(gap[a], max(0.5 * (at_begin + at_end), 0.0))
 
 
-@njit(types.int64[::1](_ints, _ints, _floats, types.int64))
+@njit(types.int64[::1](INTS, INTS, FLOATS, types.int64))
 def colour_greedily(first, neighbour, shared, n_colours):
     """
     Colour sites greedily, to minimise the edge length shared by sites of equal colour.

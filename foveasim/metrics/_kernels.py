@@ -6,10 +6,7 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
-
-_ints = types.Array(types.int64, 1, "C", readonly=True)
-_floats = types.Array(types.float64, 1, "C", readonly=True)
-_points = types.Array(types.float64, 2, "C", readonly=True)
+from foveasim._core.jit.types import FLOATS, FLOATS_2D, INTS
 
 #: Angle (rad) below which the truncated series of sin(v)/v - 1 is exact to float64.
 SERIES_BELOW = 1e-2
@@ -26,7 +23,7 @@ def _sinc_less_one(v):
     return np.sin(v) / v - 1.0
 
 
-@njit(types.complex128[:, ::1](_points, _ints, _ints, _points, _floats, _points))
+@njit(types.complex128[:, ::1](FLOATS_2D, INTS, INTS, FLOATS_2D, FLOATS, FLOATS_2D))
 def polygon_transforms(xy, ring_offsets, site_offsets, centre, area, wave):
     """
     Compute the mean of exp(-i k·(x - centre)) over each site, (n_site, n_wave).

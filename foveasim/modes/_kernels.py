@@ -22,6 +22,7 @@ from numba import types
 
 from foveasim._core._kernels import philox_4x64, uniform
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLOATS, FLOATS_2D
 
 #: State of a change-detecting site: low-pass level, its difference from the level of the last event, end of the refractory
 #: time, and integrated noise rate until the next noise event.
@@ -36,8 +37,6 @@ MIN_CHANGE = 1e-4
 MAX_STEPS = 80
 
 _bytes, _sites, _counts = types.int8[::1], types.int32[::1], types.int64[::1]
-_row = types.Array(types.float64, 1, "C", readonly=True)
-_rows = types.Array(types.float64, 2, "C", readonly=True)
 
 
 @njit()
@@ -104,7 +103,7 @@ def _crossing(slope, swing, tau, begin, difference, on, off, end):
 
 @njit(
     types.int64(
-        _rows, _rows, types.float64, types.int64, _row, _row, _row, types.float64, types.float64,
+        FLOATS_2D, FLOATS_2D, types.float64, types.int64, FLOATS, FLOATS, FLOATS, types.float64, types.float64,
         types.float64, types.float64, types.uint64, types.uint64, types.int64, types.int64,
         types.float64[:, ::1], _counts, _counts, types.float64[::1], _sites, _bytes,
     ),
@@ -202,7 +201,7 @@ def _gamma(shape, key_0, key_1, site, number):
 
 @njit(
     types.int64(
-        _rows, types.float64, types.int64, _row, types.float64, types.boolean, types.uint64, types.uint64, types.int64,
+        FLOATS_2D, types.float64, types.int64, FLOATS, types.float64, types.boolean, types.uint64, types.uint64, types.int64,
         types.int64, types.float64[:, ::1], _counts, _counts, types.float64[::1], _sites, _bytes,
     ),
 )  # fmt: skip

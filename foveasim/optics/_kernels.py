@@ -10,8 +10,8 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLOATS, FLOATS_2D, INTS, INTS_2D, array_of
 
-_floats = types.Array(types.float64, 1, "C", readonly=True)
 #: Columns per pass of a transposition: a cache line of complex64.
 COLUMNS_TOGETHER = 8
 #: Terms of a cubic spline at a point.
@@ -46,13 +46,13 @@ def _weigh(line, factors, profiles):
 @njit(
     [
         types.void(
-            types.Array(cell, 2, "C", readonly=True),
-            types.Array(real, 1, "C", readonly=True),
-            types.Array(real, 1, "C", readonly=True),
+            array_of(cell, 2),
+            array_of(real),
+            array_of(real),
             types.int64,
-            types.Array(real, 3, "C", readonly=True),
-            types.Array(real, 3, "C", readonly=True),
-            types.Array(types.int64, 1, "C", readonly=True),
+            array_of(real, 3),
+            array_of(real, 3),
+            INTS,
             types.int64,
             real[:, ::1],
         )
@@ -95,12 +95,7 @@ def apply_falloff(rows, x2, y2, power, along_y, profiles, source_column, n_befor
 _PAIRS = ((types.complex64, types.float32), (types.complex128, types.float64))
 
 
-def _in(kind, n_dimensions):
-    """Return the type of a C-contiguous input array."""
-    return types.Array(kind, n_dimensions, "C", readonly=True)
-
-
-@njit([types.void(_in(c, 2), types.int64, c[:, ::1]) for c, _ in _PAIRS])
+@njit([types.void(array_of(c, 2), types.int64, c[:, ::1]) for c, _ in _PAIRS])
 def store_rows(rows, first, lines):
     """
     Write rows ``first, first + 1, ...`` of a spectrum to its columns, ``lines``.
@@ -113,7 +108,7 @@ def store_rows(rows, first, lines):
                 lines[column, first + row] = rows[row, column]
 
 
-@njit([types.void(_in(c, 2), types.int64, c[:, ::1]) for c, _ in _PAIRS])
+@njit([types.void(array_of(c, 2), types.int64, c[:, ::1]) for c, _ in _PAIRS])
 def load_rows(lines, first, rows):
     """Read rows of a spectrum from its columns: the inverse of :func:`store_rows`."""
     for begin in range(0, lines.shape[0], COLUMNS_TOGETHER):
@@ -122,7 +117,7 @@ def load_rows(lines, first, rows):
                 rows[row, column] = lines[column, first + row]
 
 
-@njit([types.void(_in(types.int64, 1), types.int64, types.int64, c[:, ::1]) for c, _ in _PAIRS])
+@njit([types.void(INTS, types.int64, types.int64, c[:, ::1]) for c, _ in _PAIRS])
 def pad_lines(source_row, n_before, n_rows, lines):
     """
     Write the padding of columns before and after their picture rows.
@@ -140,7 +135,7 @@ def pad_lines(source_row, n_before, n_rows, lines):
 
 @njit(
     [
-        types.void(_in(real, 3), _in(types.int64, 1), _in(types.int64, 2), _in(real, 2), real[:, :, ::1])
+        types.void(array_of(real, 3), INTS, INTS_2D, array_of(real, 2), real[:, :, ::1])
         for real in (types.float32, types.float64)
     ]
 )
@@ -171,7 +166,7 @@ def pad_pictures(pictures, source_row, runs, window, out):
                 begin += n
 
 
-@njit([types.void(_in(c, 2), types.int64, _in(c, 1), _in(c, 1), types.int64, c[:, ::1]) for c, _ in _PAIRS])
+@njit([types.void(array_of(c, 2), types.int64, array_of(c), array_of(c), types.int64, c[:, ::1]) for c, _ in _PAIRS])
 def replicate(lines, n_columns, phase_x, phase_y, first, out):
     """
     Write columns of a periodically repeated spectrum, times a phase factor.
@@ -207,7 +202,16 @@ def _count_below(values, row, limit):
 @njit(
     [
         types.void(
-            _in(r, 1), r, _in(r, 2), _in(r, 2), _in(r, 2), _in(r, 2), _in(r, 2), _in(r, 2), types.int64, r[:, ::1]
+            array_of(r),
+            r,
+            array_of(r, 2),
+            array_of(r, 2),
+            array_of(r, 2),
+            array_of(r, 2),
+            array_of(r, 2),
+            array_of(r, 2),
+            types.int64,
+            r[:, ::1],
         )
         for _, r in _PAIRS
     ],
@@ -270,7 +274,16 @@ def _interpolate_plane(table, u, v):
 @njit(
     [
         types.void(
-            _in(c, 2), r, _in(r, 2), _in(r, 2), _in(r, 2), _in(r, 2), _in(c, 2), _in(c, 2), types.int64, c[:, ::1]
+            array_of(c, 2),
+            r,
+            array_of(r, 2),
+            array_of(r, 2),
+            array_of(r, 2),
+            array_of(r, 2),
+            array_of(c, 2),
+            array_of(c, 2),
+            types.int64,
+            c[:, ::1],
         )
         for c, r in _PAIRS
     ],
@@ -319,7 +332,7 @@ def _add_product(line, factor, size, is_first, total):
 
 @njit(
     [
-        types.void(_in(c, 3), _in(h, 3), _in(r, 3), types.int64, types.boolean, c[:, :, ::1])
+        types.void(array_of(c, 3), array_of(h, 3), array_of(r, 3), types.int64, types.boolean, c[:, :, ::1])
         for c, r in _PAIRS
         for h in (r, c)
     ],
@@ -363,11 +376,11 @@ def filter_and_sum(lines, factors, coefficients, first, is_added, out):
 
 @njit(
     types.void(
-        types.Array(types.complex128, 2, "C", readonly=True),
+        array_of(types.complex128, 2),
         types.float64,
-        _floats,
-        _in(types.int64, 1),
-        _in(types.float64, 2),
+        FLOATS,
+        INTS,
+        FLOATS_2D,
         types.complex128[:, ::1],
     ),
 )
@@ -383,7 +396,7 @@ def add_plane_aliases(table, per_step, cycles, k, gain, total):
                     total[i, j] += gain[a, i] * gain[b, j] * _interpolate_plane(table, (cycles[j] + k[b]) * per_step, v)
 
 
-@njit(types.void(_floats, types.float64, _floats, _in(types.int64, 1), _in(types.float64, 2), types.float64[:, ::1]))
+@njit(types.void(FLOATS, types.float64, FLOATS, INTS, FLOATS_2D, types.float64[:, ::1]))
 def add_aliases(table, per_step, cycles, k, gain, total):
     """
     Add a radial table at all aliases except ``k = 0``.

@@ -12,6 +12,7 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLOATS_2D, INTS, INTS_2D
 
 #: Largest number of natural neighbours: a random point has six, and the centre of a ring of sites has the complete ring.
 MAX_TRIANGLES = 4096
@@ -23,15 +24,6 @@ CORNER_FRACTION = 1e-10
 #: A point outside the hull by less than this fraction of the squared extent of the sites, as the area of the triangle with the
 #: hull edge, is on the hull.
 HULL_AREA = 1e-14
-
-
-def _input(dtype, ndim):
-    """Return the type of an input array: C-contiguous, read-only or writeable."""
-    return types.Array(dtype, ndim, "C", readonly=True)
-
-
-_points = _input(types.float64, 2)
-_table = _input(types.int64, 2)
 
 
 @njit()
@@ -56,7 +48,7 @@ def _step(x, y, t, xy, corners, neighbours):
     return t
 
 
-@njit(types.void(_points, _points, _table, _table, types.int64[::1]))
+@njit(types.void(FLOATS_2D, FLOATS_2D, INTS_2D, INTS_2D, types.int64[::1]))
 def find_triangles(points, xy, corners, neighbours, found):
     """
     Find the triangle of a Delaunay triangulation that contains each point, -1 outside.
@@ -86,13 +78,13 @@ def find_triangles(points, xy, corners, neighbours, found):
 
 @njit(
     types.void(
-        _points,
-        _input(types.int64, 1),
-        _points,
-        _points,
-        _table,
-        _table,
-        _points,
+        FLOATS_2D,
+        INTS,
+        FLOATS_2D,
+        FLOATS_2D,
+        INTS_2D,
+        INTS_2D,
+        FLOATS_2D,
         types.boolean,
         types.float64[:, ::1],
     ),
@@ -211,7 +203,7 @@ def interpolate(points, start, xy, values, corners, neighbours, circles, is_smoo
                 area[corners[triangles[i], k]] = 0.0
 
 
-@njit(types.void(_points, types.float64, types.float64, types.float64[:, ::1]))
+@njit(types.void(FLOATS_2D, types.float64, types.float64, types.float64[:, ::1]))
 def add_roughness(picture, weight_x, weight_y, out):
     """
     Add the gradient of half the weighted sum of squared neighbour differences.

@@ -5,9 +5,10 @@ from __future__ import annotations
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import array_of
 
 _images = types.float32[:, :, ::1]
-_table = types.Array(types.float32, 1, "C", readonly=True)
+_table = array_of(types.float32)
 
 
 @njit([types.void(types.Array(of, 3, "A", readonly=True), _table, _images) for of in (types.uint8, types.uint16)])

@@ -14,6 +14,7 @@ from numba import types
 
 from foveasim._core._kernels import BATCH, fill_normals, fill_uniforms, philox_2x32, philox_4x64, uniform
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLOATS, FLOATS_2D, INTS, array_of
 from foveasim.sensor.adc import CODE_ROUNDING, ConversionTables
 from foveasim.sensor.effects.shot import PoissonTables
 from foveasim.sensor.model.prediction import ChargeDistributions, ChargeTables, Transfer
@@ -57,21 +58,16 @@ PIECE = 512
 BISECTIONS = 60
 SQRT_HALF, SQRT_TWO_PI, TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi), 2.0 * math.pi
 
-_floats = types.Array(types.float64, 1, "C", readonly=True)
-_ints = types.Array(types.int64, 1, "C", readonly=True)
-_lines = types.Array(types.int32, 1, "C", readonly=True)
-_words = types.Array(types.uint64, 1, "C", readonly=True)
-_points = types.Array(types.float64, 2, "C", readonly=True)
+_lines = array_of(types.int32)
+_words = array_of(types.uint64)
 _number, _count = types.float64, types.int64
 _adc = types.NamedTuple(
-    (_number, _count, _number, _floats, _count, _floats, _number, types.uint64, _floats), ConversionTables
+    (_number, _count, _number, FLOATS, _count, FLOATS, _number, types.uint64, FLOATS), ConversionTables
 )
-_charges = types.NamedTuple((_floats, _floats, _floats, _floats, _floats, types.boolean), ChargeDistributions)
-_charge_tables = types.NamedTuple((_ints, _ints, _floats), ChargeTables)
-_poisson_tables = types.NamedTuple(
-    (types.Array(types.float64, 2, "C", readonly=True), types.Array(types.uint16, 2, "C", readonly=True)), PoissonTables
-)
-_transfer = types.NamedTuple((_floats, _floats, _floats, _floats, _number, _number), Transfer)
+_charges = types.NamedTuple((FLOATS, FLOATS, FLOATS, FLOATS, FLOATS, types.boolean), ChargeDistributions)
+_charge_tables = types.NamedTuple((INTS, INTS, FLOATS), ChargeTables)
+_poisson_tables = types.NamedTuple((FLOATS_2D, array_of(types.uint16, 2)), PoissonTables)
+_transfer = types.NamedTuple((FLOATS, FLOATS, FLOATS, FLOATS, _number, _number), Transfer)
 
 _LOW, _ONE_IN_2_32 = np.uint64(0xFFFFFFFF), 2.0**-32
 
@@ -150,7 +146,7 @@ def draw_poisson(charge_e, gaussian_above_e, tables, key):
 
 
 @njit(
-    [types.void(_floats, index, index, _floats, types.int64, types.float64[::1]) for index in (_lines, _ints)],
+    [types.void(FLOATS, index, index, FLOATS, types.int64, types.float64[::1]) for index in (_lines, INTS)],
 )
 def mix(fractions, columns, offsets, charge_e, first, mixed_e):
     """Multiply rows of a sparse matrix, from row ``first``, by the charges of all sites."""
@@ -323,7 +319,7 @@ def _charge_at_code(value, site, adc):
     return (v - sense_v) / per_e
 
 
-@njit([types.void(_floats, _lines, _adc, code[::1]) for code in (types.uint8, types.uint16)])
+@njit([types.void(FLOATS, _lines, _adc, code[::1]) for code in (types.uint8, types.uint16)])
 def convert(voltage_v, line, adc, code):
     """
     Convert voltages to codes: clipping, companding, INL, DNL, quantisation.

@@ -6,15 +6,13 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLOATS, FLOATS_2D, INTS, array_of
 
-_ints = types.Array(types.int64, 1, "C", readonly=True)
-_floats = types.Array(types.float64, 1, "C", readonly=True)
-_points = types.Array(types.float64, 2, "C", readonly=True)
-_ids = types.Array(types.int32, 2, "C", readonly=True)
-_colours = types.Array(types.float32, 2, "C", readonly=True)
-_encoded = types.Array(types.uint8, 1, "C", readonly=True)
-_light = types.Array(types.float32, 3, "C", readonly=True)
-_bits = types.Array(types.uint64, 2, "C", readonly=True)
+_ids = array_of(types.int32, 2)
+_colours = array_of(types.float32, 2)
+_encoded = array_of(types.uint8)
+_light = array_of(types.float32, 3)
+_bits = array_of(types.uint64, 2)
 #: Odd multipliers of hashes: 2⁶⁴ divided by the golden ratio, and a prime of xxHash64.
 _MIX, _PRIME = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
 _HALF_WORD = np.uint64(32)
@@ -50,7 +48,7 @@ def _searchsorted_uniform(samples, samples_per_length, value):
     return k
 
 
-@njit(types.void(_points, _ints, _floats, _floats, types.int64, types.int32[:, ::1]))
+@njit(types.void(FLOATS_2D, INTS, FLOATS, FLOATS, types.int64, types.int32[:, ::1]))
 def rows_of_sites(xy, starts, x, y, first, rows):
     """
     Compute the range of sample rows that each site covers.
@@ -70,7 +68,7 @@ def rows_of_sites(xy, starts, x, y, first, rows):
             rows[i, 1] = _searchsorted_uniform(y, per_y, high_y)
 
 
-@njit(types.void(_points, _ints, _ints, _ids, _floats, _floats, types.int64, types.int32[:, ::1]))
+@njit(types.void(FLOATS_2D, INTS, INTS, _ids, FLOATS, FLOATS, types.int64, types.int32[:, ::1]))
 def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
     """
     Write the index of the site at each sample of a band of rows.
@@ -148,7 +146,7 @@ def blend(ids, colours, encoded, n_samples, has_boundaries, first_row, band):
             band[row, column, 3] = (255 * n + n_samples * n_samples // 2) // (n_samples * n_samples)
 
 
-@njit(types.void(_light, types.Array(types.float32, 2, "C", readonly=True), _encoded, types.uint8[:, :, ::1]))
+@njit(types.void(_light, array_of(types.float32, 2), _encoded, types.uint8[:, :, ::1]))
 def encode_pixels(light, coverage, encoded, pixels):
     """
     Store linear light and coverage as bytes (n_y, n_x, 4), top row first.
@@ -169,7 +167,7 @@ def encode_pixels(light, coverage, encoded, pixels):
             pixels[row, column, 3] = int(_BYTES * covered + _HALF)
 
 
-@njit(types.float64[::1](_points, _ints, _ints))
+@njit(types.float64[::1](FLOATS_2D, INTS, INTS))
 def smallest_fan_triangles(xy, first, end):
     """
     Return the smallest signed area of the triangles of fans, (n,).
@@ -240,7 +238,7 @@ def number_points(bits, position, first):
     return n_found
 
 
-@njit(types.int64[:, ::1](_ints, _ints))
+@njit(types.int64[:, ::1](INTS, INTS))
 def outer_edges(position, ring_offsets):
     """
     Return the edges of rings that no other edge coincides with, pairs of positions (n, 2).

@@ -6,16 +6,18 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLOATS_2D, array_of
 
-_points = types.Array(types.float64, 2, "C", readonly=True)
-_triangles = types.Array(types.int32, 2, "C", readonly=True)
+_triangles = array_of(types.int32, 2)
 
 #: Tolerance in pixels within which a pixel centre lies on an edge and is drawn, so that adjacent triangles leave no gap.
 ON_EDGE = 1e-9
 
 
 @njit(
-    types.void(_points, _triangles, types.int32, types.int64, types.int64, types.float64[:, ::1], types.int32[:, ::1]),
+    types.void(
+        FLOATS_2D, _triangles, types.int32, types.int64, types.int64, types.float64[:, ::1], types.int32[:, ::1]
+    ),
 )
 def draw_triangles(screen, triangles, first_id, first_row, end_row, nearness, ids):
     """

@@ -6,12 +6,12 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLAGS, INTS, INTS_2D, array_of
 
-_bytes = types.Array(types.uint8, 1, "C", readonly=True)
-_flags = types.Array(types.boolean, 1, "C", readonly=True)
+_bytes = array_of(types.uint8)
 
 
-@njit(types.UniTuple(types.int64, 2)(_bytes, _flags, types.int64))
+@njit(types.UniTuple(types.int64, 2)(_bytes, FLAGS, types.int64))
 def walk_records(data, is_known, last):
     """
     Follow the records up to type ``last``, an invalid record, or the end of the data.
@@ -29,11 +29,7 @@ def walk_records(data, is_known, last):
     return at, record
 
 
-_table = types.Array(types.int64, 2, "C", readonly=True)
-_keys = types.Array(types.int64, 1, "C", readonly=True)
-
-
-@njit(types.Array(types.boolean, 1, "C")(_table, _keys, types.int64))
+@njit(types.Array(types.boolean, 1, "C")(INTS_2D, INTS, types.int64))
 def progressions(rows, group, at_most):
     """
     Divide rows into arithmetic progressions.
@@ -73,7 +69,7 @@ _MIX = (
 _29 = np.uint64(29)
 
 
-@njit(types.Tuple((types.Array(types.uint64, 1, "C"), types.Array(types.int64, 2, "C")))(_table, _keys, _keys))
+@njit(types.Tuple((types.Array(types.uint64, 1, "C"), types.Array(types.int64, 2, "C")))(INTS_2D, INTS, INTS))
 def outline_hashes(xy, ring_offsets, site_offsets):
     """
     Return a hash of each outline that does not depend on its position, and its origin.
@@ -106,7 +102,7 @@ def outline_hashes(xy, ring_offsets, site_offsets):
     return hashes, origin
 
 
-@njit(types.Array(types.boolean, 1, "C")(_table, _keys, _keys, _table, _keys))
+@njit(types.Array(types.boolean, 1, "C")(INTS_2D, INTS, INTS, INTS_2D, INTS))
 def are_congruent(xy, ring_offsets, site_offsets, origin, model):
     """
     Return whether each site is a translated copy of its model, vertex by vertex.

@@ -18,6 +18,7 @@ from numba import types
 
 from foveasim._core._kernels import N_MOMENTS, add_outline, moments_below
 from foveasim._core.jit import njit
+from foveasim._core.jit.types import FLOATS, FLOATS_2D, FLOATS_3D, INTS
 
 #: Vertices of the polygon in an image of the pupil: its area is that of the disc to 7e-4.
 N_PUPIL = 96
@@ -38,12 +39,9 @@ MIN_SINE = 1e-8
 #: Edges with a smaller change of x per change of y are vertical.
 MIN_COTANGENT = 1e-14
 
-_floats = types.Array(types.float64, 1, "C", readonly=True)
-_points = types.Array(types.float64, 2, "C", readonly=True)
-_ints = types.Array(types.int64, 1, "C", readonly=True)
 _out1, _out2 = types.Array(types.float64, 1, "C"), types.Array(types.float64, 2, "C")
 _number = types.float64
-_rings = (_points, _ints, _ints)
+_rings = (FLOATS_2D, INTS, INTS)
 
 
 @njit()
@@ -262,7 +260,7 @@ def _fill_overlaps(edges_a, n_a, edges_b, n_b, is_convex, rays, n_rays, planes, 
             _add_overlap(edges_a, n_a, edges_b, n_b, i, rays, sums)
 
 
-@njit(types.void(*_rings, *_rings, _points, _out2, _out2))
+@njit(types.void(*_rings, *_rings, FLOATS_2D, _out2, _out2))
 def overlap_moments(a_xy, a_rings, a_sites, b_xy, b_rings, b_sites, displacement, out, reference):
     """
     Write the moments of A ∩ (B - d) of one site, (n, 6), for displacements (n, 2).
@@ -283,7 +281,7 @@ def overlap_moments(a_xy, a_rings, a_sites, b_xy, b_rings, b_sites, displacement
     reference[:] = sums.T
 
 
-@njit(types.void(*_rings, _points, _points, _points, _points, _ints, _out2))
+@njit(types.void(*_rings, FLOATS_2D, FLOATS_2D, FLOATS_2D, FLOATS_2D, INTS, _out2))
 def affine_images(xy, ring_offsets, site_offsets, centre, mean, maps, target, site_of, out):
     """
     Write the vertices of affine images of outlines, ``M (x - c - m) + m + shift + target``.
@@ -499,8 +497,8 @@ def _write_map(before, after, out):
 
 @njit(
     types.void(
-        _points, _number, _floats, _floats, _points, _floats, _ints, types.boolean, *_rings, *_rings, _ints, types.boolean,
-        _points, _points, _out2,
+        FLOATS_2D, _number, FLOATS, FLOATS, FLOATS_2D, FLOATS, INTS, types.boolean, *_rings, *_rings, INTS, types.boolean,
+        FLOATS_2D, FLOATS_2D, _out2,
     )
 )  # fmt: skip
 def cone_footprints(
@@ -613,7 +611,7 @@ def _density(squared_tangent, height_um, squared_index):
     return 1.0 / ((1.0 + squared_tangent) ** 2 * jacobian), squared_tangent * per_tangent * per_tangent
 
 
-@njit(types.void(_points, _number, _floats, _floats, _points, *_rings, _ints, _points, _out1))
+@njit(types.void(FLOATS_2D, _number, FLOATS, FLOATS, FLOATS_2D, *_rings, INTS, FLOATS_2D, _out1))
 def pupil_fractions(chief_rays, radius, height_um, squared_index, shift, xy, rings, sites, site_of, centre, out):
     """
     Write the fractions of images of clear circular pupils on photodiodes.
@@ -668,7 +666,7 @@ def pupil_fractions(chief_rays, radius, height_um, squared_index, shift, xy, rin
         out[k] = min(max(powers[0] / powers[1], 0.0), 1.0)
 
 
-@njit(types.void(_points, _number, _floats, _floats, _points, _floats, _points, *_rings, _ints, _points, _out1))
+@njit(types.void(FLOATS_2D, _number, FLOATS, FLOATS, FLOATS_2D, FLOATS, FLOATS_2D, *_rings, INTS, FLOATS_2D, _out1))
 def ray_fractions(
     chief_rays, radius, height_um, squared_index, points, weights, shift, xy, rings, sites, site_of, centre, out
 ):
@@ -688,9 +686,6 @@ def ray_fractions(
         out[k] = min(total, 1.0)
 
 
-_nodes = types.Array(types.float64, 3, "C", readonly=True)
-
-
 @njit()
 def _between(x, n):
     """Return the interval of n nodes at 0, 1, ... that contains x, and the fraction."""
@@ -698,7 +693,7 @@ def _between(x, n):
     return j, x - j
 
 
-@njit(types.void(_points, _number, _number, _number, _nodes, _out2))
+@njit(types.void(FLOATS_2D, _number, _number, _number, FLOATS_3D, _out2))
 def interpolate(field, step, first_column, first_row, nodes, out):
     """Interpolate values (n_row, n_column, n_value) at multiples of a step bilinearly."""
     for k in range(out.shape[0]):
@@ -710,7 +705,7 @@ def interpolate(field, step, first_column, first_row, nodes, out):
             out[k, v] = (1.0 - x) * low + x * high
 
 
-@njit(types.void(_floats, _floats, _number, _number, _number, _nodes, types.Array(types.float64, 3, "C")))
+@njit(types.void(FLOATS, FLOATS, _number, _number, _number, FLOATS_3D, types.Array(types.float64, 3, "C")))
 def interpolate_rows(x, y, step, first_column, first_row, nodes, out):
     """Interpolate as :func:`interpolate` at x and y, (n_y, n_x, n_value)."""
     line = np.empty((nodes.shape[1], nodes.shape[2]))

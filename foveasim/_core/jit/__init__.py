@@ -31,7 +31,7 @@ from foveasim.errors import FileError
 
 _log = logging.getLogger("foveasim")
 #: The package, whose modules ``_*kernels`` contain the kernels.
-PACKAGE = Path(__file__).parents[1]
+PACKAGE = Path(__file__).parents[2]
 #: Module of numba that reads and writes machine code on disk; its objects have a ``cache_path``.
 CACHE_MODULE = "numba.core.caching"
 #: Options of all kernels. Division by 0 gives infinity or NaN, as in numpy: a check in each loop prevents vectorisation.
