@@ -40,7 +40,7 @@ from foveasim._io.zarr_stores import ZARR, open_group, store_format
 from foveasim.camera import Camera
 from foveasim.camera._clock import Clock
 from foveasim.camera._footprints import find_footprints, placed
-from foveasim.camera._steps import WeightedMap, capture_settings, expose, integrate_maps, white_dn
+from foveasim.camera._steps import WeightedMap, capture_rates, capture_settings, integrate_maps, white_dn
 from foveasim.camera._warnings import Covered, warn_of_coarse_cells, warn_of_coverage, warn_of_focal_length
 from foveasim.capture import Capture
 from foveasim.columns import COLUMNS, STORED, column_info
@@ -155,7 +155,7 @@ def _whole_blocks(tile_sites: int) -> int:
 def _tiles(
     camera: Camera, source: Scene | PowerMap, exposure_s: float, streams: Streams, tile_sites: int, tiles: range
 ) -> Iterator[Capture]:
-    layout, light = camera.layout, camera.seen(source)
+    layout, light = camera.layout, camera.light_at_gaze(source)
     if isinstance(light, Scene):
         warn_of_focal_length(camera.optics, camera.distortion, light)
     images = _images(camera, light)
@@ -194,7 +194,7 @@ def _tiles(
         # Arrays per site are those of all sites, as in a stored capture.
         about = {"first_site": first, "n_sites": layout.n_sites}
         part_streams = Streams(streams.seed, streams.frame, first // BLOCK_SITES)
-        yield expose(camera, sensor, light, rate_e_per_s, exposure_s, part_streams, clock, tile=about)
+        yield capture_rates(camera, sensor, light, rate_e_per_s, exposure_s, part_streams, clock, tile=about)
     if coverages:
         gaze_um = camera.gaze_um if any(camera.gaze_um) else None
         warn_of_coverage(source, Covered.union(smallest_grid.bounds_um, coverages), layout.n_sites, gaze_um)

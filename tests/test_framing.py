@@ -42,16 +42,18 @@ def camera_of(layout=LAYOUT, optics=OPTICS, **parts):
 def test_pitch_follows_from_thin_lens(fit, image_um):
     camera = camera_of()
 
-    assert camera.frame(scene_of(fit=fit)).pitch_um == pytest.approx(image_um / MAGNIFICATION, rel=1e-12)
+    assert camera.fit_scene(scene_of(fit=fit)).pitch_um == pytest.approx(image_um / MAGNIFICATION, rel=1e-12)
     focused_at_infinity = camera.replace(optics=replace(OPTICS, focus_distance_m=np.inf))
     magnification = FOCAL_MM / (1e3 * DISTANCE_M)
-    assert focused_at_infinity.frame(scene_of(fit=fit)).pitch_um == pytest.approx(image_um / magnification, rel=1e-12)
+    assert focused_at_infinity.fit_scene(scene_of(fit=fit)).pitch_um == pytest.approx(
+        image_um / magnification, rel=1e-12
+    )
 
 
 def test_alternating_scenes_have_their_own_pitch():
     camera, wide, high = camera_of(), scene_of(), scene_of(PICTURE.T)
 
-    pitches_um = [camera.frame(scene).pitch_um for scene in (wide, high, wide, high)]
+    pitches_um = [camera.fit_scene(scene).pitch_um for scene in (wide, high, wide, high)]
 
     # 30 µm over 200 rows, and 40 µm over 200 columns.
     assert pitches_um[:2] == pytest.approx([30 / 200 / MAGNIFICATION, 40 / 200 / MAGNIFICATION], rel=1e-12)
@@ -77,11 +79,11 @@ def test_edges_of_picture_meet_layout(fit):
 @settings(max_examples=examples(30))
 def test_cover_and_contain_are_dual(n_x, n_y, n_columns, n_rows):
     """A picture lies within a layout when the layout, as a picture, covers the picture, as a layout."""
-    within = camera_of(fs.layout.grid(n_x=n_columns, n_y=n_rows, pitch_um=1.0)).frame(
+    within = camera_of(fs.layout.grid(n_x=n_columns, n_y=n_rows, pitch_um=1.0)).fit_scene(
         scene_of(np.ones((n_y, n_x)), fit="contain")
     )
     picture_as_layout = fs.Layout.from_rectangles([[0.0, 0.0]], [[float(n_x), float(n_y)]])
-    around = camera_of(picture_as_layout).frame(scene_of(np.ones((n_rows, n_columns)), fit="cover"))
+    around = camera_of(picture_as_layout).fit_scene(scene_of(np.ones((n_rows, n_columns)), fit="cover"))
 
     assert within.pitch_um * around.pitch_um * MAGNIFICATION**2 == pytest.approx(1.0, rel=1e-12)
 
@@ -102,7 +104,7 @@ def test_moved_layout_is_framed_from_lens_axis(move_um, fit, image_um):
     lens = fs.distortion.BrownConrady(focal_um=1e3 * IMAGE_DISTANCE_MM)
     camera = camera_of(LAYOUT.translate(*move_um), distortion=lens)
 
-    assert camera.frame(scene_of(fit=fit)).pitch_um == pytest.approx(image_um / MAGNIFICATION, rel=2e-5)
+    assert camera.fit_scene(scene_of(fit=fit)).pitch_um == pytest.approx(image_um / MAGNIFICATION, rel=2e-5)
 
 
 @pytest.mark.filterwarnings("ignore:.*lie partly or completely outside the image")
@@ -117,7 +119,7 @@ def test_picture_is_framed_on_moved_layout(fit, dx_um, dy_um):
     bounds_um = np.array(moved.image_grid(scene).bounds_um) - [dx_um, dy_um, dx_um, dy_um]
 
     # A layout whose centre is within 1e-9 of its size from the origin counts as centred there.
-    assert moved.frame(scene).pitch_um == pytest.approx(centred.frame(scene).pitch_um, rel=4e-9)
+    assert moved.fit_scene(scene).pitch_um == pytest.approx(centred.fit_scene(scene).pitch_um, rel=4e-9)
     np.testing.assert_allclose(bounds_um, centred.image_grid(scene).bounds_um, atol=1e-7)
     np.testing.assert_allclose(
         moved.photoelectrons_per_s(scene), centred.photoelectrons_per_s(scene), rtol=1e-5
@@ -147,10 +149,10 @@ def test_cover_contains_undistorted_outlines(k1, is_one_site):
         extreme_um = np.array([undistorted_radius_um(half_um, k1, focal_um) for half_um in corner_um])
     camera = camera_of(layout, distortion=lens)
 
-    image_um = camera.frame(scene_of(fit="cover")).pitch_um * MAGNIFICATION
+    image_um = camera.fit_scene(scene_of(fit="cover")).pitch_um * MAGNIFICATION
     exact_um = max(2.0 * extreme_um[0] / N_X, 2.0 * extreme_um[1] / N_Y)
     assert exact_um <= image_um <= exact_um * (1.0 + 2e-5)
-    image_um = camera.frame(scene_of(fit="contain")).pitch_um * MAGNIFICATION
+    image_um = camera.fit_scene(scene_of(fit="contain")).pitch_um * MAGNIFICATION
     assert image_um == pytest.approx(min(2.0 * extreme_um[0] / N_X, 2.0 * extreme_um[1] / N_Y), rel=1e-5)
     camera.photoelectrons_per_s(scene_of(fit="cover"))  # without a CoverageWarning
 
@@ -168,7 +170,7 @@ def test_two_focal_lengths_stretch_the_picture():
     """The image is scaled by sqrt(fx / fy) along x and its inverse along y."""
     stretch = 1.5
     lens = fs.distortion.BrownConrady(focal_um=(1e4 * stretch, 1e4 / stretch))
-    pitch_um = camera_of(distortion=lens).frame(scene_of(fit="cover")).pitch_um
+    pitch_um = camera_of(distortion=lens).fit_scene(scene_of(fit="cover")).pitch_um
 
     expected_um = max(40 / 300 / stretch, 30 / 200 * stretch) / MAGNIFICATION
     assert pitch_um == pytest.approx(expected_um, rel=2e-5)
@@ -181,12 +183,12 @@ def test_sites_outside_image_circle_do_not_count():
     with pytest.warns(CoverageWarning, match="1 of 2 photosites lie outside the image circle"):
         camera_of(layout, distortion=lens).photoelectrons_per_s(scene_of(fit="cover"))
 
-    one = camera_of(layout[:1], distortion=lens).frame(scene_of(fit="cover"))
-    assert camera_of(layout, distortion=lens).frame(scene_of(fit="cover")).pitch_um == pytest.approx(one.pitch_um)
+    one = camera_of(layout[:1], distortion=lens).fit_scene(scene_of(fit="cover"))
+    assert camera_of(layout, distortion=lens).fit_scene(scene_of(fit="cover")).pitch_um == pytest.approx(one.pitch_um)
     with pytest.raises(
         ParameterError, match=r"^'fit' must be used with a layout that has photosites in the image circle"
     ):
-        camera_of(layout[1:], distortion=lens).frame(scene_of(fit="cover"))
+        camera_of(layout[1:], distortion=lens).fit_scene(scene_of(fit="cover"))
 
 
 def test_all_wavelengths_are_covered_and_contained():
@@ -201,7 +203,7 @@ def test_all_wavelengths_are_covered_and_contained():
         )
         for fit in ("cover", "contain", "width")
     }
-    pitch_um = {fit: camera_of(optics=optics).frame(scene).pitch_um for fit, scene in scenes.items()}
+    pitch_um = {fit: camera_of(optics=optics).fit_scene(scene).pitch_um for fit, scene in scenes.items()}
 
     assert pitch_um["cover"] == pytest.approx(30 / 200 / MAGNIFICATION / 0.98, rel=1e-12)
     assert pitch_um["contain"] == pytest.approx(40 / 300 / MAGNIFICATION / 1.01, rel=1e-12)
@@ -216,13 +218,13 @@ def test_field_of_view_determines_pitch():
     assert OPTICS.grid(scene).pitch_x_um * N_X == pytest.approx(
         2e3 * IMAGE_DISTANCE_MM * np.tan(np.deg2rad(20.0)), rel=1e-12
     )
-    assert camera_of().frame(scene) is scene
+    assert camera_of().fit_scene(scene) is scene
 
 
 def test_results_equal_those_of_framed_scene():
     camera = camera_of()
     scene = scene_of(fit="cover")
-    framed = camera.frame(scene)
+    framed = camera.fit_scene(scene)
     exposure = {"exposure_s": 0.01}
     by_fit, by_pitch = (camera.capture(light, **exposure, seed=3) for light in (scene, framed))
 
@@ -279,7 +281,7 @@ def test_panned_parts_have_the_same_pitch():
     ((part, _),) = pan_camera(scene, path, OPTICS, shape=(50, 60))
 
     assert part.pitch_um == scene.pitch_um
-    with pytest.raises(ParameterError, match=r"'scene' must have a pixel pitch.*camera\.frame\(scene\)"):
+    with pytest.raises(ParameterError, match=r"'scene' must have a pixel pitch.*camera\.fit_scene\(scene\)"):
         pan_camera(scene_of(fit="cover"), path, OPTICS, shape=(50, 60))
 
 
@@ -347,10 +349,10 @@ def test_impossible_framing_is_one_line(layout, fit, message):
 
 
 def test_optics_require_a_pitch():
-    with pytest.raises(ParameterError, match=r"^'scene' must have a pixel pitch.*pass camera\.frame\(scene\)"):
+    with pytest.raises(ParameterError, match=r"^'scene' must have a pixel pitch.*pass camera\.fit_scene\(scene\)"):
         OPTICS.power_map(scene_of(fit="cover"))
     with pytest.raises(ParameterError, match="must be a Scene, got a PowerMap"):
-        camera_of().frame(fs.PowerMap.from_array(np.ones((2, 2)), pitch_um=1.0, wavelength_nm=550.0))
+        camera_of().fit_scene(fs.PowerMap.from_array(np.ones((2, 2)), pitch_um=1.0, wavelength_nm=550.0))
 
 
 def test_bounds_of_many_sites_are_exact():
@@ -377,7 +379,7 @@ def test_scene_with_fit_is_drawn_in_pixels():
 def test_optical_axis_stays_with_framed_scene():
     """A part, a copy in another process and a displacement keep the axis that several cameras have in common."""
     centred, aside = (camera_of(fs.layout.grid(n_x=20, n_y=10, pitch_um=1.0).translate(x, 0.0)) for x in (0.0, 30.0))
-    framed = centred.frame(scene_of(fit="cover"), others=[aside])
+    framed = centred.fit_scene(scene_of(fit="cover"), others=[aside])
     part = replace(framed, basis=framed.basis[:, 1:-1, 1:-1])
 
     assert framed.axis_um == (15.0, 0.0)

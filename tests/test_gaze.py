@@ -42,7 +42,7 @@ def camera_of(layout=HEXAGONS, optics=OPTICS, *, read_noise_e=3.0, **parts):
 @pytest.mark.parametrize("fit", ["cover", "contain", "width"])
 def test_scale_does_not_depend_on_gaze(fit):
     camera, scene = camera_of(optics=replace(OPTICS, f_number=2.0)), scene_of(fit=fit)
-    pitch_um = camera.frame(scene).pitch_um
+    pitch_um = camera.fit_scene(scene).pitch_um
     gazes_um = np.random.default_rng(0).uniform(-200.0, 200.0, (50, 2))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CoverageWarning)
@@ -65,7 +65,7 @@ def test_points_land_at_position_minus_gaze(axis):
     def centroid_um(gaze_um):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CoverageWarning)
-            found = camera.photoelectrons_per_s(scene, gaze_um=gaze_um).reshape(60, 80)
+            found = camera.with_gaze(gaze_um).photoelectrons_per_s(scene).reshape(60, 80)
         moments = cv2.moments(found)
         return np.array([moments["m10"], moments["m01"]]) / moments["m00"] * 2.0
 
@@ -80,12 +80,12 @@ def test_gaze_by_whole_sites_is_a_translation():
     cv2 = pytest.importorskip("cv2")
     large = camera_of(fs.layout.grid(n_x=80, n_y=60, pitch_um=2.0))
     scene = scene_of(fit="cover")
-    pitched = large.frame(scene).with_pitch(large.frame(scene).pitch_um)
+    pitched = large.fit_scene(scene).with_pitch(large.fit_scene(scene).pitch_um)
     small = camera_of(fs.layout.grid(n_x=40, n_y=30, pitch_um=2.0))
     whole = large.photoelectrons_per_s(pitched).reshape(60, 80)
 
     for columns, rows in ((5, -7), (-12, 3)):
-        found = small.photoelectrons_per_s(pitched, gaze_um=(2.0 * columns, 2.0 * rows)).reshape(30, 40)
+        found = small.with_gaze((2.0 * columns, 2.0 * rows)).photoelectrons_per_s(pitched).reshape(30, 40)
         by_opencv = cv2.warpAffine(whole, np.float64([[1, 0, -columns], [0, 1, -rows]]), (80, 60))
         np.testing.assert_allclose(found, by_opencv[15:45, 20:60], rtol=1e-6)
 
@@ -94,7 +94,7 @@ def test_gaze_by_whole_sites_is_a_translation():
 @pytest.mark.parametrize("order", [1, 2])
 def test_gaze_equals_layout_moved_in_the_image(lens, order):
     camera, scene = camera_of(distortion=lens, order=order), scene_of()
-    pitched = camera.frame(scene).with_pitch(camera.frame(scene).pitch_um)
+    pitched = camera.fit_scene(scene).with_pitch(camera.fit_scene(scene).pitch_um)
     moved = camera_of(HEXAGONS.translate(*GAZE_UM), distortion=lens, order=order)
     arguments = {"exposure_s": EXPOSURE_S, "seed": 1}
 
@@ -104,7 +104,7 @@ def test_gaze_equals_layout_moved_in_the_image(lens, order):
     assert np.array_equal(capture.code, expected.code)
     of_map = camera.power_map(pitched)
     np.testing.assert_array_equal(
-        camera.photoelectrons_per_s(of_map, gaze_um=GAZE_UM), moved.photoelectrons_per_s(of_map)
+        camera.with_gaze(GAZE_UM).photoelectrons_per_s(of_map), moved.photoelectrons_per_s(of_map)
     )
 
 
@@ -118,9 +118,9 @@ def test_range_of_gazes_is_covered():
     spare = np.array([x1 - x0 - (right - left) - 60.0, y1 - y0 - (top - bottom) - 40.0])
     assert spare.min() == pytest.approx(0.0, abs=1e-9)
     for gaze_um in ((30.0, 20.0), (-30.0, 20.0), (-30.0, -20.0)):
-        camera.photoelectrons_per_s(scene, gaze_um=gaze_um)  # without a CoverageWarning
+        camera.with_gaze(gaze_um).photoelectrons_per_s(scene)  # without a CoverageWarning
     with pytest.warns(CoverageWarning, match=r"outside the image at the gaze \(30, 40\) µm.*gaze_range_um=\(30, 40\)"):
-        camera.photoelectrons_per_s(scene, gaze_um=(30.0, 40.0))
+        camera.with_gaze((30.0, 40.0)).photoelectrons_per_s(scene)
 
 
 # -- axis --------------------------------------------------------------------------------------------------------------
@@ -137,8 +137,8 @@ def test_relative_illumination_stays_with_its_axis():
     image_distance_um = 2e3 / (1.0 - 2e-3)
 
     centre = camera.photoelectrons_per_s(scene)[4]
-    by_image = camera.photoelectrons_per_s(scene, gaze_um=gaze_um)[4]
-    by_sensor = camera.photoelectrons_per_s(scene, gaze_um=gaze_um, axis="sensor")[4]
+    by_image = camera.with_gaze(gaze_um).photoelectrons_per_s(scene)[4]
+    by_sensor = camera.with_gaze(gaze_um, "sensor").photoelectrons_per_s(scene)[4]
     assert by_image / centre == pytest.approx((1.0 + np.dot(gaze_um, gaze_um) / image_distance_um**2) ** -2, rel=2e-3)
     assert by_sensor == pytest.approx(centre, rel=1e-4)
 
@@ -164,7 +164,7 @@ def test_turned_camera_sees_displaced_picture(optics):
     columns, rows = 7, -4
     displaced = replace(scene, basis=np.roll(scene.basis, (-rows, -columns), axis=(1, 2)))
 
-    found = camera.photoelectrons_per_s(scene, gaze_um=(columns * cell_um, rows * cell_um))
+    found = camera.with_gaze((columns * cell_um, rows * cell_um)).photoelectrons_per_s(scene)
     np.testing.assert_allclose(found, camera.photoelectrons_per_s(displaced), rtol=2e-5)
 
 
@@ -180,10 +180,8 @@ def test_coma_stays_with_its_axis():
     gaze_um = (30.0 * cell_um, 20.0 * cell_um)
     camera, ideal = camera_of(optics=optics, order=1), camera_of(optics=sharp, order=1)
 
-    expected = ideal.photoelectrons_per_s(scene, gaze_um=gaze_um)
-    by_sensor, by_image = (
-        camera.photoelectrons_per_s(scene, gaze_um=gaze_um, axis=axis) for axis in ("sensor", "image")
-    )
+    expected = ideal.with_gaze(gaze_um).photoelectrons_per_s(scene)
+    by_sensor, by_image = (camera.with_gaze(gaze_um, axis).photoelectrons_per_s(scene) for axis in ("sensor", "image"))
     difference = [np.abs(each - expected).sum() / expected.sum() for each in (by_sensor, by_image)]
     assert difference[0] < 0.1
     assert difference[1] > 1.0
@@ -194,7 +192,7 @@ def test_power_map_cannot_turn():
     power_map = camera.power_map(scene_of())
 
     with pytest.raises(ParameterError, match="'axis' must be 'image' for a power map"):
-        camera.photoelectrons_per_s(power_map, gaze_um=GAZE_UM, axis="sensor")
+        camera.with_gaze(GAZE_UM, "sensor").photoelectrons_per_s(power_map)
 
 
 # -- all routes --------------------------------------------------------------------------------------------------------
@@ -266,15 +264,13 @@ def test_predictions_have_the_gaze(files, axis, expected):
     sensor, sites = shot.camera.sensor, [3, 7, 50]
 
     np.testing.assert_array_equal(shot.camera.predict(shot.scene, **gaze), sensor.predict(expected.expected_e))
+    turned = shot.camera.with_gaze(GAZE_UM, axis)
     np.testing.assert_array_equal(
-        shot.camera.predict_covariance(shot.scene, sites, **gaze), sensor.predict_covariance(expected.expected_e, sites)
+        turned.predict_covariance(shot.scene, sites, exposure_s=EXPOSURE_S),
+        sensor.predict_covariance(expected.expected_e, sites),
     )
-    turned = shot.camera.at(GAZE_UM, axis)
-    budget, other = (
-        camera.noise_budget(shot.scene, exposure_s=EXPOSURE_S, **options)
-        for camera, options in ((shot.camera, {"gaze_um": GAZE_UM, "axis": axis}), (turned, {}))
-    )
-    assert all(np.array_equal(budget[name], other[name]) for name in budget)
+    budget = turned.noise_budget(shot.scene, exposure_s=EXPOSURE_S)
+    np.testing.assert_allclose(budget["photon_shot"] ** 2 + budget["dark_shot"] ** 2, expected.expected_e, rtol=1e-9)
 
 
 def test_videos_have_the_gaze(files, axis, expected):
@@ -297,7 +293,7 @@ def test_videos_have_the_gaze(files, axis, expected):
 
 def test_tiles_have_the_gaze(files, axis, expected):
     shot = read_shot(files / "shot.yaml")
-    (tile,) = fs.tiles.capture_tiles(shot.camera.at(GAZE_UM, axis), shot.scene, exposure_s=EXPOSURE_S, seed=1)
+    (tile,) = fs.tiles.capture_tiles(shot.camera.with_gaze(GAZE_UM, axis), shot.scene, exposure_s=EXPOSURE_S, seed=1)
 
     assert np.array_equal(tile.code, expected.code)
     assert tile.settings["gaze_um"] == list(GAZE_UM)
@@ -316,7 +312,7 @@ def test_sweeps_have_the_gaze(files, axis, expected):
             "axis": axis,
         }
         _, capture = runner.simulate_capture(data)
-        assert capture.settings["light"]["pitch_um"] == base.camera.frame(base.scene).pitch_um
+        assert capture.settings["light"]["pitch_um"] == base.camera.fit_scene(base.scene).pitch_um
     assert np.array_equal(capture.code, expected.code)
     # Images of a fixed lens are computed once.
     assert runner.cache.n_built["images"] == (1 if axis == "image" else 3)
@@ -341,7 +337,7 @@ def test_datasets_have_the_gaze(files, axis, expected):
     np.testing.assert_array_equal(fixed[0]["expected_e"], expected.expected_e)
     for sample in varied:
         gaze_um = (sample["settings"]["gaze_um.0"], sample["settings"]["gaze_um.1"])
-        found = base.camera.photoelectrons_per_s(base.scene, gaze_um=gaze_um, axis=axis) * EXPOSURE_S
+        found = base.camera.with_gaze(gaze_um, axis).photoelectrons_per_s(base.scene) * EXPOSURE_S
         np.testing.assert_allclose(sample["expected_e"], found, rtol=1e-12)
         # Boxes are positions on the layout.
         x0, _, x1, y1 = base.camera.image_grid(base.scene).bounds_um
@@ -381,12 +377,12 @@ def test_comparisons_have_the_gaze(files):
     from foveasim import compare
 
     square = fs.layout.grid(n_x=12, n_y=10, pitch_um=5.0)
-    named = {"hexagonal": camera_of().at(GAZE_UM), "square": camera_of(square).at(GAZE_UM)}
-    light = camera_of().frame(scene_of())
+    named = {"hexagonal": camera_of().with_gaze(GAZE_UM), "square": camera_of(square).with_gaze(GAZE_UM)}
+    light = camera_of().fit_scene(scene_of())
     scenes = {"noise": light.with_pitch(light.pitch_um)}
     found = compare.cameras(named, scenes, exposure_s=EXPOSURE_S, max_pixels=32, n_annuli=2)
     still = compare.cameras(
-        {name: camera.at((0.0, 0.0)) for name, camera in named.items()},
+        {name: camera.with_gaze((0.0, 0.0)) for name, camera in named.items()},
         scenes,
         exposure_s=EXPOSURE_S,
         max_pixels=32,
@@ -396,7 +392,7 @@ def test_comparisons_have_the_gaze(files):
     magnification = OPTICS.magnification(DISTANCE_M)
     centre_um = (-GAZE_UM[0] / magnification, -GAZE_UM[1] / magnification)
     displaced = compare.cameras(
-        {name: camera.at((0.0, 0.0)) for name, camera in named.items()},
+        {name: camera.with_gaze((0.0, 0.0)) for name, camera in named.items()},
         {"noise": scenes["noise"].with_centre(centre_um)}, exposure_s=EXPOSURE_S, max_pixels=32, n_annuli=2,
     )  # fmt: skip
 
@@ -410,9 +406,9 @@ def test_ideal_pictures_have_the_gaze(axis):
     camera, scene = camera_of(), scene_of()
     grid = fs.Grid.centred((6, 8), 4.0)
     sites = fs.layout.grid(n_x=8, n_y=6, pitch_um=4.0)
-    ideal = camera.at(GAZE_UM, axis).reference(scene, grid, exposure_s=EXPOSURE_S)
-    seen = camera_of(sites, order=1).at(GAZE_UM, axis)
-    pitched = camera.frame(scene).with_pitch(camera.frame(scene).pitch_um)
+    ideal = camera.with_gaze(GAZE_UM, axis).reference(scene, grid, exposure_s=EXPOSURE_S)
+    seen = camera_of(sites, order=1).with_gaze(GAZE_UM, axis)
+    pitched = camera.fit_scene(scene).with_pitch(camera.fit_scene(scene).pitch_um)
     found = seen.photoelectrons_per_s(pitched) * EXPOSURE_S / 16.0
 
     np.testing.assert_allclose(ideal.data[0].ravel(), found, rtol=1e-5)
@@ -421,11 +417,11 @@ def test_ideal_pictures_have_the_gaze(axis):
 
 def test_cameras_share_their_compiled_layouts():
     camera, scene = camera_of(), scene_of()
-    turned = camera.at(GAZE_UM)
+    turned = camera.with_gaze(GAZE_UM)
     first = turned.photoelectrons_per_s(scene)
-    assert turned.at(None) is turned
+    assert turned.with_gaze(None) is turned
     assert any(key[2] == GAZE_UM for key in camera._integrators)
-    assert np.array_equal(camera.at(GAZE_UM).photoelectrons_per_s(scene), first)
+    assert np.array_equal(camera.with_gaze(GAZE_UM).photoelectrons_per_s(scene), first)
     assert turned.replace(optics=replace(OPTICS, f_number=8.0)).gaze_um == GAZE_UM
 
 

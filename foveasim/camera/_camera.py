@@ -6,47 +6,37 @@ The only module that knows the order of the stages and creates random streams.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
-from threading import Lock
 from typing import Annotated, Any, Literal, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from foveasim._core.calls import NOT_NEGATIVE, Limits, OwnCheck
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
-from foveasim._core.threads import cached_property, in_order, thread_count
-from foveasim._core.validation import Bools, Floats, check_per_site, check_point, finite_array, read_only
-from foveasim._core.work_arrays import trim_heaps
+from foveasim._core.threads import cached_property, thread_count
+from foveasim._core.validation import Floats, check_per_site, check_point, finite_array
 from foveasim.camera._clock import Clock
 from foveasim.camera._colour import colour_correction
-from foveasim.camera._exposure import AUTO_SETTINGS, ExposureTime, exposure_time
-from foveasim.camera._footprints import FootprintCache, find_footprints, find_incidence, placed
-from foveasim.camera._frames import Frame, ImageCache, Position, Task, check_frames, position_settings, tasks
+from foveasim.camera._exposure import ExposureTime
+from foveasim.camera._footprints import FootprintCache, find_incidence, placed
+from foveasim.camera._frames import Frame, ImageCache, Position, check_frames
 from foveasim.camera._framing import axis_of, common_bounds_um, fit_scene
-from foveasim.camera._steps import SensorFrame, WeightedMap, expose, integrate_maps, white_dn
-from foveasim.camera._warnings import (
-    Covered,
-    warn_of_coarse_cells,
-    warn_of_coarse_pixels,
-    warn_of_coverage,
-    warn_of_exposure,
-    warn_of_focal_length,
-)
+from foveasim.camera._rates import expected_rates, footprints_at
+from foveasim.camera._steps import SensorFrame, capture_for_time, check_exposure, seconds_of, white_dn
+from foveasim.camera._video import rates_of_frames, video
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
-from foveasim.errors import FoveasimWarning, ParameterError, type_name, warn
+from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PowerMap
 from foveasim.incidence import Incidence
 from foveasim.integrate import Integrator, outline_bounds_um
 from foveasim.layout.model import Layout
-from foveasim.modes import Between, Exposure, Shutter
+from foveasim.modes import Between
 from foveasim.optics import Optics
 from foveasim.reconstruct import Picture, reference
 from foveasim.reconstruct.rasters import sum_of_images
@@ -58,8 +48,6 @@ from foveasim.units import um_from_nm, w_from_w_m2_um2
 
 #: What the optical axis is fixed to when the gaze moves: see :class:`Camera`.
 GazeAxis = Literal["image", "sensor"]
-#: Exposures that exceed the time between them by this fraction do so by rounding.
-TIME_ROUNDING = 1e-9
 #: Number of compiled layouts in the cache, per grid of one image.
 MAX_CACHED_INTEGRATORS = 4
 #: In cells of at most this width, in units of λN, irradiance is smooth: second-order integration is up to 70 times more
@@ -231,7 +219,7 @@ class Camera:
         cell_um = self._optics.grid(light).pitch_x_um / self.oversample(light)
         return 2 if cell_um <= SMOOTH_LAMBDA_N * narrowest_um else 1
 
-    def frame(self, scene: Scene, *, others: Iterable[Camera] = ()) -> Scene:
+    def fit_scene(self, scene: Scene, *, others: Iterable[Camera] = ()) -> Scene:
         """
         Return a scene with the pixel pitch that its ``fit`` requires with this camera.
 
@@ -270,7 +258,7 @@ class Camera:
         >>> wide, high = (fs.layout.grid(n_x=n, n_y=60 - n, pitch_um=1.0) for n in (40, 20))
         >>> cameras = [fs.Camera(optics=optics, sensor=fs.Sensor(layout)) for layout in (wide, high)]
         >>> scene = fs.Scene.from_picture(np.ones((10, 10)), fit="cover", distance_m=1.0, illuminance_lux=500.0)
-        >>> framed = cameras[0].frame(scene, others=cameras[1:])
+        >>> framed = cameras[0].fit_scene(scene, others=cameras[1:])
         >>> [round(camera.image_grid(framed).bounds_um[2], 6) for camera in cameras]
         [20.0, 20.0]
         """
@@ -301,15 +289,15 @@ class Camera:
 
     def _with_pitch(self, light: Scene | PowerMap) -> Scene | PowerMap:
         """Return a scene with its pitch, or a power map."""
-        return self.frame(light) if isinstance(light, Scene) else light
+        return self.fit_scene(light) if isinstance(light, Scene) else light
 
     @overload
-    def seen(self, light: Scene, gaze_um: Position | None = None) -> Scene: ...
+    def light_at_gaze(self, light: Scene, gaze_um: Position | None = None) -> Scene: ...
 
     @overload
-    def seen(self, light: PowerMap, gaze_um: Position | None = None) -> PowerMap: ...
+    def light_at_gaze(self, light: PowerMap, gaze_um: Position | None = None) -> PowerMap: ...
 
-    def seen(self, light: Scene | PowerMap, gaze_um: Position | None = None) -> Scene | PowerMap:
+    def light_at_gaze(self, light: Scene | PowerMap, gaze_um: Position | None = None) -> Scene | PowerMap:
         """
         Return a scene with its pitch, where a camera that turns towards a gaze sees it.
 
@@ -338,7 +326,7 @@ class Camera:
                 "must be 'image' for a power map: its relative illumination and aberrations are fixed",
                 self._axis,
             )
-        scene = self.frame(light)
+        scene = self.fit_scene(light)
         per_um = self.sensor_frame(scene).scale * self._optics.magnification(scene.distance_m)
         x_um, y_um = (np.array(scene.centre_um) - gaze / per_um).tolist()
         return scene.with_centre((x_um, y_um))
@@ -357,13 +345,13 @@ class Camera:
         Grid
             :meth:`Optics.grid`, centred on the optical axis: the principal point of the distortion model.
         """
-        return self.sensor_frame(scene).image(self._optics.grid(self._seen_scene(scene)))
+        return self.sensor_frame(scene).image(self._optics.grid(self._scene_at_gaze(scene)))
 
-    def _seen_scene(self, scene: Scene) -> Scene:
-        """Return :meth:`seen` of a scene."""
-        seen = self.seen(scene)
-        assert isinstance(seen, Scene)
-        return seen
+    def _scene_at_gaze(self, scene: Scene) -> Scene:
+        """Return :meth:`light_at_gaze` of a scene."""
+        found = self.light_at_gaze(scene)
+        assert isinstance(found, Scene)
+        return found
 
     def power_map(self, scene: Scene) -> PowerMap:
         """
@@ -382,7 +370,7 @@ class Camera:
         ParameterError, SimulationError
             When the distance of the scene is at most the focal length, or the result is not finite.
         """
-        scene = self._seen_scene(scene)
+        scene = self._scene_at_gaze(scene)
         power_map = self._optics.resolve_oversample(scene).power_map(scene, n_threads=self._n_threads)
         return PowerMap(power_map.data, self.sensor_frame(scene).image(power_map.grid), power_map.wavelength_nm)
 
@@ -474,7 +462,7 @@ class Camera:
                 other._integrators = self._integrators
         return other
 
-    def at(self, gaze_um: tuple[float, float] | None, axis: GazeAxis | None = None) -> Camera:
+    def with_gaze(self, gaze_um: tuple[float, float] | None, axis: GazeAxis | None = None) -> Camera:
         """
         Return the camera with another gaze.
 
@@ -495,21 +483,19 @@ class Camera:
         >>> import foveasim as fs
         >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
         >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout))
-        >>> camera.at((20.0, -5.0)).gaze_um
+        >>> camera.with_gaze((20.0, -5.0)).gaze_um
         (20.0, -5.0)
         """
         if gaze_um is None and axis is None:
             return self
         other = self.replace(gaze_um=gaze_um, axis=axis)
-        other._warned = self._warned  # noqa: SLF001 -- of the same class
+        other._warned = self._warned
         return other
 
     def photoelectrons_per_s(
         self,
         light: Scene | PowerMap,
         *,
-        gaze_um: tuple[float, float] | None = None,
-        axis: GazeAxis | None = None,
         images: ImageCache | None = None,
     ) -> Floats:
         """
@@ -519,8 +505,6 @@ class Camera:
         ----------
         light : Scene or PowerMap
             A scene, or a power map from any optics program.
-        gaze_um, axis : optional
-            As for :meth:`at`.
         images : dict, optional
             Cache of the scene's images, read and extended: for further layouts with the same optics, scene and colour
             filters.
@@ -536,9 +520,7 @@ class Camera:
         SimulationError
             When the power map is not finite within a site.
         """
-        if gaze_um is not None or axis is not None:
-            return self.at(gaze_um, axis).photoelectrons_per_s(light, images=images)
-        return self._photoelectrons_per_s(light, Clock(), cached=images)
+        return expected_rates(self, light, Clock(), cached=images)
 
     def capture(
         self,
@@ -572,48 +554,20 @@ class Camera:
             warnings of the exposure.
         """
         if gaze_um is not None or axis is not None:
-            return self.at(gaze_um, axis).capture(
+            return self.with_gaze(gaze_um, axis).capture(
                 light, exposure_s=exposure_s, seed=seed, frame=frame, photo_e_per_s=photo_e_per_s
             )
         streams = Streams(seed, frame)
         clock, is_given = Clock(), photo_e_per_s is not None
         if photo_e_per_s is None:
-            photo_e_per_s = self._photoelectrons_per_s(light, clock)
+            photo_e_per_s = expected_rates(self, light, clock)
         else:
             photo_e_per_s = finite_array("photo_e_per_s", photo_e_per_s, at_least=0.0)
             check_per_site("photo_e_per_s", photo_e_per_s, self._layout.n_sites)
-        capture = self._expose(light, photo_e_per_s, exposure_s, streams, clock)
+        capture = capture_for_time(self, light, photo_e_per_s, exposure_s, streams, clock)
         if not is_given:
-            self._check_exposure(light, photo_e_per_s, capture)
+            check_exposure(self, light, photo_e_per_s, capture)
         return capture
-
-    def _expose(
-        self,
-        light: Scene | PowerMap,
-        photo_e_per_s: Floats,
-        exposure_s: ExposureTime,
-        streams: Streams,
-        clock: Clock,
-        **settings: Any,
-    ) -> Capture:
-        """Expose the sensor for a time, or automatically."""
-        settings |= AUTO_SETTINGS if exposure_s == "auto" else {}
-        with clock.stage("sensor"):
-            time_s = self._exposure_s(exposure_s, photo_e_per_s)
-        return expose(self, self._sensor, light, photo_e_per_s, time_s, streams, clock, **settings)
-
-    def _check_exposure(self, light: Scene | PowerMap, photo_e_per_s: Floats, capture: Capture) -> None:
-        """Warn of an exposure that is wrong for the scene."""
-        exposure_s = float(capture.settings["exposure_s"])
-        if isinstance(light, Scene) and exposure_s > 0.0:
-            warn_of_exposure(
-                self._sensor, photo_e_per_s, exposure_s, capture, self._warned, is_picture=light.is_picture
-            )
-
-    def _exposure_s(self, exposure_s: ExposureTime, photo_e_per_s: Floats) -> float:
-        """Return an exposure time in seconds."""
-        time_s = exposure_time(exposure_s, self._optics.f_number)
-        return self._sensor.exposure_for(photo_e_per_s, n_threads=self._n_threads) if time_s == "auto" else time_s
 
     def auto_exposure(
         self,
@@ -621,8 +575,6 @@ class Camera:
         *,
         target: Annotated[float, TARGET] = AUTO_TARGET,
         percentile: Annotated[float, PERCENTILE] = AUTO_PERCENTILE,
-        gaze_um: tuple[float, float] | None = None,
-        axis: GazeAxis | None = None,
     ) -> float:
         """
         Return the exposure time that makes a bright photosite reach a fraction of its range.
@@ -633,8 +585,6 @@ class Camera:
         target, percentile : float
             Fraction of the range from black to saturation, and percentile of the sites that reaches it:
             :meth:`foveasim.Sensor.exposure_for`.
-        gaze_um, axis : optional
-            As for :meth:`capture`.
 
         Returns
         -------
@@ -658,7 +608,7 @@ class Camera:
         >>> round(float(capture.electrons.mean()) / 1e4, 1)
         0.5
         """
-        rates = self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis)
+        rates = self.photoelectrons_per_s(light)
         return self._sensor.exposure_for(rates, target=target, percentile=percentile, n_threads=self._n_threads)
 
     def rates(self, frames: OwnCheck[Iterable[Frame]], *, ahead: Annotated[int, NOT_NEGATIVE] = 0) -> Iterator[Floats]:
@@ -677,7 +627,7 @@ class Camera:
             As :meth:`photoelectrons_per_s` returns it. Read-only: repeated frames share one array.
         """
         check_frames(frames)
-        return (rate_e_per_s for _, rate_e_per_s in self._frame_rates(frames, Clock(), ahead))
+        return (rate_e_per_s for _, rate_e_per_s in rates_of_frames(self, frames, Clock(), ahead))
 
     def video(
         self,
@@ -755,109 +705,17 @@ class Camera:
         >>> [c.settings["frame"] for c in camera.video([scene, scene], exposure_s=0.01, seed=0)]
         [0, 1]
         """
-        if isinstance(exposure_s, str):
-            times_s: Sequence[ExposureTime] = [exposure_time(exposure_s, self._optics.f_number)]
-        else:
-            exposures_s = EXPOSURE.check_array("exposure_s", exposure_s)
-            if exposures_s.ndim > 1 or exposures_s.size == 0:
-                raise ParameterError("exposure_s", "must be one time, or a sequence of times", exposure_s, "s")
-            times_s = exposures_s.reshape(-1).tolist()
-        check_frames(frames)
-        if frame_s is None and (line_s or between != "hold" or every != 1):
-            name = "line_s" if line_s else "between" if between != "hold" else "every"
-            raise ParameterError(name, "requires 'frame_s', the frame period")
-        streams = Streams(seed, first_frame)
-        if frame_s is None:
-            return self._separate(frames, times_s, streams, ahead)
-        shutter = Shutter(self._layout, frame_s, line_s, between)
-        longest_s = max((time_s for time_s in times_s if isinstance(time_s, float)), default=0.0)
-        if longest_s > (1.0 + TIME_ROUNDING) * every * shutter.frame_s:
-            warn(
-                f"the exposure of {longest_s:g} s is longer than the {every * shutter.frame_s:g} s between the starts "
-                "of exposures, and no photosite can be exposed twice at a time; reduce 'exposure_s' or increase 'every'",
-                FoveasimWarning,
-            )
-        return self._rolling(frames, times_s, streams, shutter, every, ahead)
-
-    def _separate(
-        self, frames: Iterable[Frame], times_s: Sequence[ExposureTime], streams: Streams, ahead: int
-    ) -> Iterator[Capture]:
-        """Yield one capture per frame, each exposed to this frame alone."""
-        clock = Clock()
-        for k, (task, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
-            number = Streams(streams.seed, streams.frame + k)
-            exposure_s = times_s[number.frame % len(times_s)]
-            settings = position_settings(task)
-            capture = self._expose(task.light, rate_e_per_s, exposure_s, number, clock.take(), **settings)
-            self._check_exposure(task.light, rate_e_per_s, capture)
-            yield capture
-
-    def _rolling(
-        self,
-        frames: Iterable[Frame],
-        times_s: Sequence[ExposureTime],
-        streams: Streams,
-        shutter: Shutter,
-        every: int,
-        ahead: int,
-    ) -> Iterator[Capture]:
-        """Yield one capture per ``every`` frames, each a sum over its exposure."""
-        auto = AUTO_SETTINGS if "auto" in times_s else {}
-        times = {
-            "frame_s": shutter.frame_s,
-            "line_s": shutter.line_s,
-            "every": every,
-            "between": shutter.between,
-            **auto,
-        }
-        in_progress: deque[tuple[int, Task, Exposure]] = deque()
-        clock = Clock()
-
-        def first(last_e_per_s: Floats) -> Capture:
-            k, task, exposure = in_progress.popleft()
-            number = Streams(streams.seed, streams.frame + k)
-            mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | position_settings(task, every)
-            arguments = task.light, mean_e_per_s, exposure.exposure_s, number, clock.take()
-            return expose(self, self._sensor, *arguments, **settings)
-
-        rate_e_per_s = np.zeros(1)
-        for n, (task, rate_e_per_s) in enumerate(self._frame_rates(frames, clock, ahead)):
-            if n % every == 0:
-                k = n // every
-                exposure_s = self._exposure_s(times_s[(streams.frame + k) % len(times_s)], rate_e_per_s)
-                in_progress.append((k, task, Exposure(shutter, exposure_s)))
-            with clock.stage("shutter"):
-                for *_, exposure in in_progress:
-                    exposure.add(rate_e_per_s)
-            while in_progress and in_progress[0][-1].is_complete:
-                yield first(rate_e_per_s)
-        while in_progress:
-            yield first(rate_e_per_s)
-
-    def _frame_rates(self, frames: Iterable[Frame], clock: Clock, ahead: int) -> Iterator[tuple[Task, Floats]]:
-        """Yield each frame with its photoelectron rates."""
-        rates_of = self._photoelectrons_per_s
-        if ahead:
-            rates_of = self.replace(n_threads=1)._photoelectrons_per_s  # noqa: SLF001 -- of the same class
-        image_lock = Lock()
-        warned: set[str] = set()
-
-        def compute(task: Task) -> tuple[Task, Floats | None, Clock]:
-            own = Clock()
-            if task.is_repeated:
-                return task, None, own
-            # The first frame of a scene computes the images that its next frames share.
-            with image_lock if task.images == {} and self._axis == "image" else nullcontext():
-                gaze_um = task.position_um if task.is_moving else None
-                found = rates_of(task.light, own, gaze_um, task.images, warned)
-                return task, found, own
-
-        rate_e_per_s = np.zeros(self._layout.n_sites)
-        for task, found, own in in_order(compute, tasks(frames), self._n_threads, ahead):
-            # Repeated frames share the array.
-            rate_e_per_s = rate_e_per_s if found is None else read_only(found)
-            clock.add(own)
-            yield task, rate_e_per_s
+        return video(
+            self,
+            frames,
+            exposure_s,
+            Streams(seed, first_frame),
+            frame_s,
+            line_s=line_s,
+            every=every,
+            between=between,
+            ahead=ahead,
+        )
 
     def predict(
         self,
@@ -880,8 +738,8 @@ class Camera:
         mean_dn, variance_dn2 : (n_site,) float64, DN and DN²
             Over the temporal noise of this device; its fixed patterns are part of the mean.
         """
-        rate_e_per_s = self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis)
-        exposure_s = self._exposure_s(exposure_s, rate_e_per_s)
+        rate_e_per_s = self.with_gaze(gaze_um, axis).photoelectrons_per_s(light)
+        exposure_s = seconds_of(self, exposure_s, rate_e_per_s)
         expected_e = self._sensor.expected_electrons(rate_e_per_s, exposure_s)
         return self._sensor.predict(expected_e, exposure_s=exposure_s, n_threads=self._n_threads)
 
@@ -891,8 +749,6 @@ class Camera:
         sites: ArrayLike,
         *,
         exposure_s: ExposureTime,
-        gaze_um: tuple[float, float] | None = None,
-        axis: GazeAxis | None = None,
     ) -> Floats:
         """
         Return the temporal covariance of the codes of some sites analytically.
@@ -902,7 +758,7 @@ class Camera:
         light : Scene or PowerMap
         sites : (n,) int
             Indices of the sites.
-        exposure_s, gaze_um, axis
+        exposure_s
             As for :meth:`capture`.
 
         Returns
@@ -910,8 +766,8 @@ class Camera:
         covariance : (n, n) float64, DN²
             See :meth:`foveasim.Sensor.predict_covariance`.
         """
-        rate_e_per_s = self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis)
-        exposure_s = self._exposure_s(exposure_s, rate_e_per_s)
+        rate_e_per_s = self.photoelectrons_per_s(light)
+        exposure_s = seconds_of(self, exposure_s, rate_e_per_s)
         expected_e = self._sensor.expected_electrons(rate_e_per_s, exposure_s)
         return self._sensor.predict_covariance(expected_e, sites, exposure_s=exposure_s)
 
@@ -935,7 +791,7 @@ class Camera:
         """
         joules_per_w_m2 = float(w_from_w_m2_um2(exposure_s))
         weights = self._sensor.responsivity_e_per_j(light.wavelength_nm) * joules_per_w_m2
-        colour, scene = colour_correction(self._sensor, light), self.seen(light)
+        colour, scene = colour_correction(self._sensor, light), self.light_at_gaze(light)
         matrix = None if colour is None else colour.matrix
         shown = partial(replace, grid=grid, white=white_dn(self._sensor, light), colour_matrix=matrix)
         in_image = _moved(grid, self.position_um)
@@ -956,15 +812,13 @@ class Camera:
         light: Scene | PowerMap,
         *,
         exposure_s: ExposureTime,
-        gaze_um: tuple[float, float] | None = None,
-        axis: GazeAxis | None = None,
     ) -> NoiseBudget:
         """
         Return the noise of every site by source: :func:`foveasim.sensor.noise_budget`.
 
         Parameters
         ----------
-        light, exposure_s, gaze_um, axis
+        light, exposure_s
             As for :meth:`capture`.
 
         Returns
@@ -972,77 +826,10 @@ class Camera:
         NoiseBudget
             Standard deviation by source, a dict of str to (n_site,) float64, e-.
         """
-        rate_e_per_s = self.photoelectrons_per_s(light, gaze_um=gaze_um, axis=axis)
-        return noise_budget(self._sensor, rate_e_per_s, self._exposure_s(exposure_s, rate_e_per_s))
+        rate_e_per_s = self.photoelectrons_per_s(light)
+        return noise_budget(self._sensor, rate_e_per_s, seconds_of(self, exposure_s, rate_e_per_s))
 
-    def _photoelectrons_per_s(
-        self,
-        light: Scene | PowerMap,
-        clock: Clock,
-        moving_um: Position | None = None,
-        cached: ImageCache | None = None,
-        warned: set[str] | None = None,
-    ) -> Floats:
-        """
-        Return the expected photoelectrons of every site per second.
-
-        ``moving_um`` is the gaze of a frame with its own, or None; ``cached`` is a cache of a scene's images by grid and
-        filter, or None; ``warned`` are the warnings of earlier frames, which are not repeated.
-        """
-        if not isinstance(light, Scene | PowerMap):
-            raise ParameterError("light", f"must be a Scene or a PowerMap, got {type_name(light)}")
-        gaze_um = self._gaze_um if moving_um is None else moving_um
-        position_um = (gaze_um[0], gaze_um[1]) if self._axis == "image" else (0.0, 0.0)
-        trim_heaps()
-        source, light = light, self.seen(light, gaze_um)
-        e_per_j = self._sensor.responsivity_e_per_j(light.wavelength_nm)
-        with clock.stage("load kernels"):
-            _load_kernels(light)
-        if isinstance(light, PowerMap):
-            maps, grids = self._bands(light, e_per_j), [light.grid]
-        else:
-            warn_of_focal_length(self._optics, self._distortion, light)
-            # Lateral chromatic aberration gives images of several sizes, each with its own grid.
-            optics = self._optics.resolve_oversample(light)
-            warn_of_coarse_cells(self._optics, light, self._layout)
-            warn_of_coarse_pixels(light, self._optics.grid(light).pitch_x_um, self._layout, self._warned)
-            images, frame = optics.image_grids(light), self.sensor_frame(light)
-            # Images of a camera that turns differ for each gaze.
-            cached = None if self._axis == "sensor" and moving_um is not None else cached
-            maps, grids = (
-                self._images(light, optics, images, e_per_j, clock, cached),
-                [frame.image(grid) for grid, _ in images],
-            )
-        with clock.stage("compile layout"):
-            order, footprints = self.order(light), self._find_footprints(light, position_um)
-            integrators = [
-                self.integrator(
-                    grid,
-                    order=order,
-                    n_grids=len(grids),
-                    position_um=position_um,
-                    # Most gazes of a video occur once, and so do the images of a camera that turns.
-                    compiled=moving_um is None or gaze_um == self._gaze_um,
-                    footprints=footprints,
-                )
-                for grid in grids
-            ]
-            smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
-            covered = Covered.by(smallest)
-            if footprints is not None and footprints.outlines is not None:
-                layout = placed(self._layout, None, position_um)
-                bounds_um = (self.layout_bounds_um + np.tile(position_um, 2)).tolist()
-                covered = Covered.of(layout, bounds_um, smallest.grid, self._distortion, self._n_threads)
-        named_um = None if moving_um is None and not any(gaze_um) else gaze_um
-        warn_of_coverage(source, covered, self._layout.n_sites, named_um, warned)
-        return integrate_maps(self._sensor, light, maps, integrators, clock, footprints)
-
-    def _find_footprints(self, light: Scene | PowerMap, position_um: Position) -> Footprints | None:
-        return find_footprints(self, self._layout, self._sensor.pixel_optics, light, position_um, self._footprints)
-
-    def incidence(
-        self, light: Scene | PowerMap, *, gaze_um: tuple[float, float] | None = None, axis: GazeAxis | None = None
-    ) -> Incidence:
+    def incidence(self, light: Scene | PowerMap) -> Incidence:
         """
         Return the cones of light at the photosites.
 
@@ -1050,8 +837,6 @@ class Camera:
         ----------
         light : Scene or PowerMap
             The distance of a scene determines the cones; those of a power map are of a lens in focus.
-        gaze_um, axis : optional
-            As for :meth:`capture`.
 
         Returns
         -------
@@ -1068,21 +853,15 @@ class Camera:
         >>> cones.image_height_um.tolist(), cones.chief_ray.tolist()
         ([100.0, 100.0], [[-0.01, 0.0], [0.01, 0.0]])
         """
-        if gaze_um is not None or axis is not None:
-            return self.at(gaze_um, axis).incidence(light)
-        return find_incidence(self, self._layout, self.seen(light), self.position_um)[0]
+        return find_incidence(self, self._layout, self.light_at_gaze(light), self.position_um)[0]
 
-    def footprints(
-        self, light: Scene | PowerMap, *, gaze_um: tuple[float, float] | None = None, axis: GazeAxis | None = None
-    ) -> Footprints | None:
+    def footprints(self, light: Scene | PowerMap) -> Footprints | None:
         """
         Return the light that the photosites collect through the pixel optics of the sensor.
 
         Parameters
         ----------
         light : Scene or PowerMap
-        gaze_um, axis : optional
-            As for :meth:`capture`.
 
         Returns
         -------
@@ -1096,13 +875,9 @@ class Camera:
         GeometryError
             When an inset of the pixel optics is too large for a site.
         """
-        if gaze_um is not None or axis is not None:
-            return self.at(gaze_um, axis).footprints(light)
-        return self._find_footprints(self.seen(light), self.position_um)
+        return footprints_at(self, self.light_at_gaze(light), self.position_um)
 
-    def angular_response(
-        self, light: Scene | PowerMap, *, gaze_um: tuple[float, float] | None = None, axis: GazeAxis | None = None
-    ) -> Floats:
+    def angular_response(self, light: Scene | PowerMap) -> Floats:
         """
         Return the response of each site to uniform light through the pixel optics.
 
@@ -1110,8 +885,6 @@ class Camera:
         ----------
         light : Scene or PowerMap
             The distance of a scene determines the cone of light.
-        gaze_um, axis : optional
-            As for :meth:`capture`.
 
         Returns
         -------
@@ -1129,7 +902,7 @@ class Camera:
         >>> camera.angular_response(scene).round(2).tolist()
         [0.9, 0.9, 0.9]
         """
-        found = self.footprints(light, gaze_um=gaze_um, axis=axis)
+        found = self.footprints(light)
         if found is None:
             return np.ones(self._layout.n_sites)
         if found.mixing is None:
@@ -1137,52 +910,8 @@ class Camera:
         area_um2 = self._layout.area_um2
         return np.asarray(found.response + found.mixing @ area_um2 / area_um2)
 
-    def _bands(self, power_map: PowerMap, e_per_j: Floats) -> Iterator[WeightedMap]:
-        """Yield each band of a power map, with every site's photoelectrons per joule in it."""
-        for band, cells in enumerate(power_map.data):
-            yield WeightedMap(0, cells, None, e_per_j[self._sensor.filter_of_site, band])
-
-    def _images(
-        self,
-        scene: Scene,
-        optics: Optics,
-        images: Sequence[tuple[Grid, Bools]],
-        e_per_j: Floats,
-        clock: Clock,
-        cached: ImageCache | None,
-    ) -> Iterator[WeightedMap]:
-        """
-        Yield the photoelectron map of each filter, with its sites.
-
-        One inverse transform per filter and image, for any number of wavelengths.
-        """
-        used = self._sensor.filters_used
-
-        # As a function, without a reference in this generator: one map is in memory at a time.
-        def image(grid: Grid, c: int, maps: Iterator[NDArray[Any]]) -> NDArray[Any]:
-            with clock.stage("optics"):
-                if cached is None:
-                    return next(maps)
-                if (grid, c) not in cached:
-                    cached[grid, c] = next(maps)
-                return cached[grid, c]
-
-        for k, (grid, is_in_image) in enumerate(images):
-            new = used if cached is None else np.array([c for c in used if (grid, c) not in cached], np.int64)
-            maps = optics.weighted_maps(scene, e_per_j[new] * is_in_image, grid=grid, n_threads=self._n_threads)
-            for c in used:
-                yield WeightedMap(k, image(grid, int(c), maps), self._sensor.sites_of_filter[int(c)], None)
-
 
 def _moved(grid: Grid, by_um: Position) -> Grid:
     """Return a grid at another position."""
     (x_um, y_um), (dx_um, dy_um) = grid.origin_um, by_um
     return Grid(grid.shape, grid.pitch_um, (x_um + dx_um, y_um + dy_um))
-
-
-def _load_kernels(light: Scene | PowerMap) -> None:
-    """Import the kernels that this source needs, before other stages are timed."""
-    import foveasim.integrate._kernels
-
-    if isinstance(light, Scene):
-        import foveasim.optics._kernels  # noqa: F401

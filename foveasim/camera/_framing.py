@@ -69,7 +69,7 @@ def fit_scene(scene: Scene, optics: Optics, lens: Lens | None, bounds_um: Floats
     """
     Return a scene with the pitch and the optical axis of its framing on a field.
 
-    ``bounds_um``: of the field, (4,). See :meth:`foveasim.Camera.frame`.
+    ``bounds_um``: of the field, (4,). See :meth:`foveasim.Camera.fit_scene`.
     """
     fit, frame = scene.fit, SensorFrame.of(lens, axis_of(bounds_um))
     axis_um, range_um = np.array(frame.axis_um), np.array(scene.gaze_range_um)

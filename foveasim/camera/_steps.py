@@ -14,7 +14,8 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Bools, Floats, read_only
 from foveasim.camera._clock import Clock
 from foveasim.camera._colour import colour_correction, white_response
-from foveasim.camera._warnings import warn_of_negative
+from foveasim.camera._exposure import AUTO_SETTINGS, ExposureTime, exposure_time
+from foveasim.camera._warnings import warn_of_exposure, warn_of_negative
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import SimulationError
@@ -119,7 +120,36 @@ def _check_rates(light: Scene | PowerMap, rate_e_per_s: Floats, order: int) -> N
         warn_of_negative(rate_e_per_s, is_negative)
 
 
-def expose(
+def seconds_of(camera: Camera, exposure_s: ExposureTime, photo_e_per_s: Floats) -> float:
+    """Return an exposure time in seconds."""
+    time_s = exposure_time(exposure_s, camera.optics.f_number)
+    return camera.sensor.exposure_for(photo_e_per_s, n_threads=camera.n_threads) if time_s == "auto" else time_s
+
+
+def capture_for_time(
+    camera: Camera,
+    light: Scene | PowerMap,
+    photo_e_per_s: Floats,
+    exposure_s: ExposureTime,
+    streams: Streams,
+    clock: Clock,
+    **settings: Any,
+) -> Capture:
+    """Return the capture of photoelectron rates for a time, or with automatic exposure."""
+    settings |= AUTO_SETTINGS if exposure_s == "auto" else {}
+    with clock.stage("sensor"):
+        time_s = seconds_of(camera, exposure_s, photo_e_per_s)
+    return capture_rates(camera, camera.sensor, light, photo_e_per_s, time_s, streams, clock, **settings)
+
+
+def check_exposure(camera: Camera, light: Scene | PowerMap, photo_e_per_s: Floats, capture: Capture) -> None:
+    """Warn of an exposure that is wrong for the scene."""
+    exposure_s = float(capture.settings["exposure_s"])
+    if isinstance(light, Scene) and exposure_s > 0.0:
+        warn_of_exposure(camera.sensor, photo_e_per_s, exposure_s, capture, camera._warned, is_picture=light.is_picture)
+
+
+def capture_rates(
     camera: Camera,
     sensor: Sensor,
     light: Scene | PowerMap,
@@ -129,7 +159,7 @@ def expose(
     clock: Clock,
     **settings: Any,
 ) -> Capture:
-    """Simulate the sensor of a camera, or a part of it, for photoelectron rates."""
+    """Return the capture of photoelectron rates by the sensor of a camera, or by a part of it."""
     about = capture_settings(camera, light, exposure_s, streams) | settings
     with clock.stage("sensor"):
         expected_e, electrons, code = sensor.expose(
@@ -185,7 +215,7 @@ def _light_settings(camera: Camera, light: Scene | PowerMap) -> dict[str, object
         "kind": "Scene",
         "source": light.source,
         "shape": list(light.basis.shape),
-        "pitch_um": camera.frame(light).pitch_um,
+        "pitch_um": camera.fit_scene(light).pitch_um,
         "fit": light.fit,
         "field_of_view_deg": light.field_of_view_deg,
         "distance_m": light.distance_m,

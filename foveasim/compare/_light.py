@@ -76,7 +76,7 @@ def e_per_photon(sensor: Sensor, spectra: Sequence[Spectrum]) -> Floats:
 
 def behind_image(camera: Camera) -> Camera:
     """Return a camera for its own power maps, which already have its gaze if it turns."""
-    return camera if camera.axis == "image" else camera.at((0.0, 0.0))
+    return camera if camera.axis == "image" else camera.with_gaze((0.0, 0.0))
 
 
 def field_of(

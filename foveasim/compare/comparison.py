@@ -388,7 +388,7 @@ def cameras(
         raise ParameterError("scenes", "must be a mapping of names to at least one scene", scenes)
     # All cameras have the same image, whose scale would otherwise follow from the layout of each.
     lights = {
-        str(name): first.frame(light, others=named.values()) if isinstance(light, Scene) else light
+        str(name): first.fit_scene(light, others=named.values()) if isinstance(light, Scene) else light
         for name, light in scenes.items()
     }
     steps = count(1)
@@ -402,7 +402,7 @@ def cameras(
     photons, spectra = [], []
     for light in lights.values():
         maps: dict[tuple[float, float], PowerMap] = {}  # by the direction of cameras that turn
-        photons.append(photons_per_um2(image_of(first.at((0.0, 0.0)), light, maps), covariance_grid, exposure_s))
+        photons.append(photons_per_um2(image_of(first.with_gaze((0.0, 0.0)), light, maps), covariance_grid, exposure_s))
         spectra.append(mean_spectrum(maps[0.0, 0.0], covariance_grid))
         for name, camera in named.items():
             capture = camera.capture(light, exposure_s=exposure_s, seed=seed)

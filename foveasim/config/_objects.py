@@ -82,7 +82,7 @@ class Shot:
     name : str
         File name without extension.
     scene : Scene or PowerMap
-        A scene with ``fit`` has no pitch: ``camera.frame(scene)`` has.
+        A scene with ``fit`` has no pitch: ``camera.fit_scene(scene)`` has.
     camera : Camera
     rules : DesignRules or None
         Rules that the layout is designed for.
@@ -303,7 +303,7 @@ def build_shot(
         {"optics": optics, "sensor": sensor, "gaze_um": settings.gaze_um, "axis": settings.axis},
     )  # fmt: skip
     if isinstance(scene, Scene):
-        framed = _call(source, "scene", camera.seen, {"light": scene})
+        framed = _call(source, "scene", camera.light_at_gaze, {"light": scene})
         _call(source, "scene", optics.grid, {"scene": framed})
         _call(source, "optics", optics.check, {"scene": framed})
     return Shot(

@@ -307,7 +307,7 @@ def _image_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
     """Return all that determines the optical images of the filters in use, as plain data."""
     scene = shot.scene
     # With 'fit' the pitch depends on layout and distortion.
-    pitch_um = shot.camera.frame(scene).pitch_um if isinstance(scene, Scene) else None
+    pitch_um = shot.camera.fit_scene(scene).pitch_um if isinstance(scene, Scene) else None
     gaze_um = shot.camera.gaze_um if shot.camera.axis == "sensor" else None
     # Images that are computed together share sums, whose rounding depends on their number.
     used = shot.camera.sensor.filters_used.tolist()

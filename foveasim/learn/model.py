@@ -104,7 +104,7 @@ class Model(nn.Module):
     ) -> None:
         super().__init__()
         self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
-        self._camera, self._scene = camera, camera.seen(scene)
+        self._camera, self._scene = camera, camera.light_at_gaze(scene)
         self._boundary: Literal["fixed", "sliding", "free"] = boundary
         sensor = camera.sensor
         self.imaging: Imaging = Imaging(

@@ -75,7 +75,7 @@ def _pitch_um(scene: SceneLike) -> float:
     if scene.pitch_um is None:
         raise ParameterError(
             "scene",
-            "must have a pixel pitch, which with 'fit' depends on the layout; pass camera.frame(scene), or set 'pitch_um'",
+            "must have a pixel pitch, which with 'fit' depends on the layout; pass camera.fit_scene(scene), or set 'pitch_um'",
         )
     return scene.pitch_um
 

@@ -120,7 +120,7 @@ class Scene:
     source : str
         Origin of the basis images, for provenance.
     fit : {"cover", "contain", "width"}, optional
-        Framing on the layout of a camera, which derives the pitch: :meth:`foveasim.Camera.frame`.
+        Framing on the layout of a camera, which derives the pitch: :meth:`foveasim.Camera.fit_scene`.
     field_of_view_deg : float, optional, degrees
         Horizontal angle of the scene as seen from the lens.
     is_picture : bool
@@ -136,7 +136,7 @@ class Scene:
         Whether the three basis images are the channels of a photograph in linear sRGB, which the colour correction of captures
         reproduces.
     axis_um : (x, y), optional, µm
-        With ``fit``, where the optical axis meets the sensor; :meth:`foveasim.Camera.frame` sets it together with the pitch.
+        With ``fit``, where the optical axis meets the sensor; :meth:`foveasim.Camera.fit_scene` sets it with the pitch.
 
     Raises
     ------

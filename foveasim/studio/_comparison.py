@@ -99,7 +99,7 @@ def _framed_together(results: Sequence[Simulated]) -> list[tuple[Scene | PowerMa
     for shot, result in zip(shots, results, strict=True):
         assert isinstance(shot.scene, Scene)
         try:
-            framed, alone = shot.camera.frame(shot.scene, others=cameras), shot.camera.frame(shot.scene)
+            framed, alone = shot.camera.fit_scene(shot.scene, others=cameras), shot.camera.fit_scene(shot.scene)
         except ParameterError:  # other lenses
             return own
         is_same = (framed.pitch_um, framed.axis_um) == (alone.pitch_um, alone.axis_um)

@@ -378,11 +378,11 @@ def pan_camera(
         if scene.pitch_um is None:
             # The remaining shift moves the photosites by up to half a pixel on each side.
             margin = 1 if scene.fit == "cover" else 0
-            framed = camera.frame(_crop(scene, 0, 0, max(1, n_y - margin), max(1, n_x - margin)))
+            framed = camera.fit_scene(_crop(scene, 0, 0, max(1, n_y - margin), max(1, n_x - margin)))
             scene = scene.framed(framed.pitch_um or 0.0, framed.axis_um)
     elif scene.pitch_um is None:
         raise ParameterError(
-            "scene", "must have a pixel pitch", hint="pass the camera instead of its optics, or camera.frame(scene)"
+            "scene", "must have a pixel pitch", hint="pass the camera instead of its optics, or camera.fit_scene(scene)"
         )
     return _parts(scene, path, optics.grid(scene).pitch_x_um, n_y, n_x)
 

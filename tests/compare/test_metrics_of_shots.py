@@ -58,7 +58,7 @@ def test_metrics_equal_those_of_comparisons(camera, scene, compared):
 @pytest.mark.parametrize("axis", ["image", "sensor"])
 def test_metrics_follow_the_gaze(camera, scene, axis):
     """Camera and comparison agree for a gaze, behind a fixed lens and for a camera that turns."""
-    away = camera.at((8.0, -4.0), axis)
+    away = camera.with_gaze((8.0, -4.0), axis)
     pair = fs.compare.cameras({"one": away, "other": away}, {"blocks": scene}, exposure_s=0.01, max_pixels=64)
     capture = away.capture(scene, exposure_s=0.01, seed=0)
     for name in SAME:

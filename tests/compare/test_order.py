@@ -115,7 +115,7 @@ def test_scenes_are_framed_for_all_layouts():
         "high": fs.layout.grid(n_x=20, n_y=60, pitch_um=2.0),
     }
     cameras = {name: camera_of(layout) for name, layout in layouts.items()}
-    framed = cameras["wide"].frame(scene_of(fit="cover"), others=[cameras["high"]])
+    framed = cameras["wide"].fit_scene(scene_of(fit="cover"), others=[cameras["high"]])
 
     # The union is 120 x 120 µm, and the picture of 48 x 40 pixels covers it with its height.
     assert framed.pitch_um == pytest.approx(120.0 / OPTICS.magnification(1.0) / 40)
@@ -129,7 +129,7 @@ def test_framing_for_other_lenses_is_rejected():
     other = fs.Camera(optics=fs.Optics(focal_length_mm=9.0, f_number=2.8), sensor=fs.Sensor(layout))
 
     with pytest.raises(ParameterError, match="'others' must be cameras with the same optics"):
-        camera_of(layout).frame(scene_of(fit="cover"), others=[other])
+        camera_of(layout).fit_scene(scene_of(fit="cover"), others=[other])
 
 
 def test_budgets_are_compared_pairwise():

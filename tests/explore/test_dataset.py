@@ -482,7 +482,7 @@ def test_fit_follows_random_lens():
     data = explore.Dataset(pictures(1), SHOT, vary, cameras=3, fit="width")
     x0, _, x1, _ = data.layout.bounds_um
 
-    pitches_um = [data.shot(k).camera.frame(data.shot(k).scene).pitch_um for k in range(3)]
+    pitches_um = [data.shot(k).camera.fit_scene(data.shot(k).scene).pitch_um for k in range(3)]
     assert len(set(pitches_um)) == 3
     for k in range(3):
         assert data.shot(k).camera.image_grid(data.shot(k).scene).pitch_um * N_X == pytest.approx(x1 - x0)

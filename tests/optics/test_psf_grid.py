@@ -499,8 +499,8 @@ def test_gaze_moves_the_sensor_over_the_field(camera):
     scene, gaze_um = noise(), (6.0, -4.5)
     power_map = camera.power_map(scene)
     np.testing.assert_allclose(
-        camera.photoelectrons_per_s(scene, gaze_um=gaze_um),
-        camera.replace().photoelectrons_per_s(power_map, gaze_um=gaze_um),
+        camera.with_gaze(gaze_um).photoelectrons_per_s(scene),
+        camera.replace().with_gaze(gaze_um).photoelectrons_per_s(power_map),
         rtol=0.05,
     )
 

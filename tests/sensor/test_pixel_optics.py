@@ -557,17 +557,17 @@ def test_moved_sensor_equals_moved_layout(name, distortion):
     sensor = camera_of(RINGS, optics, distortion=distortion)
     layout = camera_of(RINGS.translate(*by_um), moved, distortion=distortion)
 
-    found = sensor.photoelectrons_per_s(PHOTOGRAPH, gaze_um=by_um)
+    found = sensor.with_gaze(by_um).photoelectrons_per_s(PHOTOGRAPH)
     np.testing.assert_allclose(found, layout.photoelectrons_per_s(PHOTOGRAPH), rtol=1e-9)
     assert not np.allclose(found, sensor.photoelectrons_per_s(PHOTOGRAPH), rtol=1e-3)
 
 
 def test_turned_camera_keeps_field_positions():
     camera = camera_of(RINGS, STACK, axis="sensor")
-    turned = camera.angular_response(PHOTOGRAPH, gaze_um=(40.0, 0.0))
+    turned = camera.with_gaze((40.0, 0.0)).angular_response(PHOTOGRAPH)
 
     np.testing.assert_array_equal(turned, camera.angular_response(PHOTOGRAPH))
-    assert np.abs(camera.angular_response(PHOTOGRAPH, gaze_um=(40.0, 0.0), axis="image") - turned).max() > 1e-3
+    assert np.abs(camera.with_gaze((40.0, 0.0), "image").angular_response(PHOTOGRAPH) - turned).max() > 1e-3
 
 
 def test_field_positions_start_at_principal_point():
@@ -601,7 +601,7 @@ def test_tiles_warn_of_layout_beyond_image(monkeypatch, recwarn):
     list(fs.tiles.capture_tiles(camera, power_map, exposure_s=0.01, seed=0, tile_sites=256))
 
     assert not any("outside the image" in str(each.message) for each in recwarn)
-    moved = camera.at((0.5, 0.0), None)
+    moved = camera.with_gaze((0.5, 0.0), None)
     with pytest.warns(FoveasimWarning, match="20 of 400 photosites lie partly or completely outside the image"):
         list(fs.tiles.capture_tiles(moved, power_map, exposure_s=0.01, seed=0, tile_sites=256))
 
@@ -629,7 +629,7 @@ def test_videos_along_gazes_equal_captures():
     gazes_um = [(0.0, 0.0), (20.0, 5.0), (0.0, 0.0), (-3.0, 8.0)]
     rates = list(camera.rates([(PHOTOGRAPH, gaze_um) for gaze_um in gazes_um]))
     for rate, gaze_um in zip(rates, gazes_um, strict=True):
-        np.testing.assert_allclose(rate, camera.photoelectrons_per_s(PHOTOGRAPH, gaze_um=gaze_um), rtol=1e-9)
+        np.testing.assert_allclose(rate, camera.with_gaze(gaze_um).photoelectrons_per_s(PHOTOGRAPH), rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", [*OPTICS, "table", "crosstalk"])

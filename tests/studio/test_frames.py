@@ -346,7 +346,7 @@ def test_comparison_is_independent_of_variant_order(settings, fit):
 
     assert all(values[::-1] == second[name] for name, values in first.items())
     # Both see the same image: the field of the union is larger than that of each.
-    assert wide.shot.camera.frame(wide.shot.scene).pitch_um != high.shot.camera.frame(high.shot.scene).pitch_um
+    assert wide.shot.camera.fit_scene(wide.shot.scene).pitch_um != high.shot.camera.fit_scene(high.shot.scene).pitch_um
 
 
 # -- notebook, archive, links -----------------------------------------------------------------------------------------------------

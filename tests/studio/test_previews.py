@@ -83,7 +83,7 @@ def test_scenes_with_fit_are_reduced(large, tmp_path):
     full, reduced = engine.simulate(large), engine.simulate(large, is_preview=True)
 
     assert reduced.is_preview
-    pitches_um = [result.shot.camera.frame(result.shot.scene).pitch_um for result in (full, reduced)]
+    pitches_um = [result.shot.camera.fit_scene(result.shot.scene).pitch_um for result in (full, reduced)]
     assert pitches_um[1] == pytest.approx(2.0 * pitches_um[0])
 
 

@@ -491,7 +491,7 @@ class Dataset:
             return found
         camera = shot.camera
         assert isinstance(shot.scene, Scene)
-        scene = camera.frame(shot.scene)
+        scene = camera.fit_scene(shot.scene)
         grid = camera.image_grid(scene)
         lens = camera.distortion
         n_grids = len(camera.optics.image_grids(scene))

@@ -29,7 +29,7 @@ def psf(result: Simulated) -> PartData:
     camera, source = result.shot.camera, result.shot.scene
     if not isinstance(source, Scene):
         return {"curves": [], "note": "A power map contains the point spread of its lens."}, {}
-    scene, frame = camera.seen(source), camera.sensor_frame(source)
+    scene, frame = camera.light_at_gaze(source), camera.sensor_frame(source)
     points_um = camera.layout.centroid_um + np.array(camera.position_um)
     height_um = np.hypot(*(points_um - frame.axis_um).T)
     chosen = {"nearest": int(height_um.argmin()), "farthest": int(height_um.argmax())}

@@ -134,7 +134,7 @@ def random_rows(message: Mapping[str, Any], shot: Shot | None, frame_s: float | 
 
 def free_um(shot: Shot) -> Floats:
     """Return the distances of the gaze within which the image covers all sites, (x, y) µm."""
-    camera, scene = shot.camera.at((0.0, 0.0)), shot.scene
+    camera, scene = shot.camera.with_gaze((0.0, 0.0)), shot.scene
     grid = scene.grid if isinstance(scene, PowerMap) else camera.image_grid(scene)
     image_um, layout_um = (np.reshape(each.bounds_um, (2, 2)) for each in (grid, camera.layout))
     margins_um = np.stack((layout_um[0] - image_um[0], image_um[1] - layout_um[1]))

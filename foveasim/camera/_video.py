@@ -1,0 +1,146 @@
+"""Captures of a sequence of frames: each exposed alone, or by a shutter."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
+from threading import Lock
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from foveasim._core.random_streams import Streams
+from foveasim._core.threads import in_order
+from foveasim._core.validation import Floats, read_only
+from foveasim.camera._clock import Clock
+from foveasim.camera._exposure import AUTO_SETTINGS, ExposureTime, exposure_time
+from foveasim.camera._frames import Frame, Task, check_frames, position_settings, tasks
+from foveasim.camera._rates import expected_rates
+from foveasim.camera._steps import capture_for_time, capture_rates, check_exposure, seconds_of
+from foveasim.capture import Capture
+from foveasim.errors import FoveasimWarning, ParameterError, warn
+from foveasim.modes import Between, Exposure, Shutter
+from foveasim.sensor.limits import EXPOSURE
+
+if TYPE_CHECKING:
+    from foveasim.camera._camera import Camera
+
+#: Exposures that exceed the time between them by this fraction do so by rounding.
+TIME_ROUNDING = 1e-9
+
+
+def video(
+    camera: Camera,
+    frames: Iterable[Frame],
+    exposure_s: ExposureTime | Sequence[float],
+    streams: Streams,
+    frame_s: float | None,
+    *,
+    line_s: float,
+    every: int,
+    between: Between,
+    ahead: int,
+) -> Iterator[Capture]:
+    """Yield captures of frames; see :meth:`foveasim.Camera.video`."""
+    if isinstance(exposure_s, str):
+        times_s: Sequence[ExposureTime] = [exposure_time(exposure_s, camera.optics.f_number)]
+    else:
+        exposures_s = EXPOSURE.check_array("exposure_s", exposure_s)
+        if exposures_s.ndim > 1 or exposures_s.size == 0:
+            raise ParameterError("exposure_s", "must be one time, or a sequence of times", exposure_s, "s")
+        times_s = exposures_s.reshape(-1).tolist()
+    check_frames(frames)
+    if frame_s is None and (line_s or between != "hold" or every != 1):
+        name = "line_s" if line_s else "between" if between != "hold" else "every"
+        raise ParameterError(name, "requires 'frame_s', the frame period")
+    if frame_s is None:
+        return _separate(camera, frames, times_s, streams, ahead)
+    shutter = Shutter(camera.layout, frame_s, line_s, between)
+    longest_s = max((time_s for time_s in times_s if isinstance(time_s, float)), default=0.0)
+    if longest_s > (1.0 + TIME_ROUNDING) * every * shutter.frame_s:
+        warn(
+            f"the exposure of {longest_s:g} s is longer than the {every * shutter.frame_s:g} s between the starts "
+            "of exposures, and no photosite can be exposed twice at a time; reduce 'exposure_s' or increase 'every'",
+            FoveasimWarning,
+        )
+    return _rolling(camera, frames, times_s, streams, shutter, every, ahead)
+
+
+def _separate(
+    camera: Camera, frames: Iterable[Frame], times_s: Sequence[ExposureTime], streams: Streams, ahead: int
+) -> Iterator[Capture]:
+    """Yield one capture per frame, each exposed to this frame alone."""
+    clock = Clock()
+    for k, (task, rate_e_per_s) in enumerate(rates_of_frames(camera, frames, clock, ahead)):
+        number = Streams(streams.seed, streams.frame + k)
+        exposure_s = times_s[number.frame % len(times_s)]
+        settings = position_settings(task)
+        capture = capture_for_time(camera, task.light, rate_e_per_s, exposure_s, number, clock.take(), **settings)
+        check_exposure(camera, task.light, rate_e_per_s, capture)
+        yield capture
+
+
+def _rolling(
+    camera: Camera,
+    frames: Iterable[Frame],
+    times_s: Sequence[ExposureTime],
+    streams: Streams,
+    shutter: Shutter,
+    every: int,
+    ahead: int,
+) -> Iterator[Capture]:
+    """Yield one capture per ``every`` frames, each a sum over its exposure."""
+    auto = AUTO_SETTINGS if "auto" in times_s else {}
+    times = {
+        "frame_s": shutter.frame_s,
+        "line_s": shutter.line_s,
+        "every": every,
+        "between": shutter.between,
+        **auto,
+    }
+    in_progress: deque[tuple[int, Task, Exposure]] = deque()
+    clock = Clock()
+
+    def first(last_e_per_s: Floats) -> Capture:
+        k, task, exposure = in_progress.popleft()
+        number = Streams(streams.seed, streams.frame + k)
+        mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | position_settings(task, every)
+        arguments = task.light, mean_e_per_s, exposure.exposure_s, number, clock.take()
+        return capture_rates(camera, camera.sensor, *arguments, **settings)
+
+    rate_e_per_s = np.zeros(1)
+    for n, (task, rate_e_per_s) in enumerate(rates_of_frames(camera, frames, clock, ahead)):
+        if n % every == 0:
+            k = n // every
+            exposure_s = seconds_of(camera, times_s[(streams.frame + k) % len(times_s)], rate_e_per_s)
+            in_progress.append((k, task, Exposure(shutter, exposure_s)))
+        with clock.stage("shutter"):
+            for *_, exposure in in_progress:
+                exposure.add(rate_e_per_s)
+        while in_progress and in_progress[0][-1].is_complete:
+            yield first(rate_e_per_s)
+    while in_progress:
+        yield first(rate_e_per_s)
+
+
+def rates_of_frames(camera: Camera, frames: Iterable[Frame], clock: Clock, ahead: int) -> Iterator[tuple[Task, Floats]]:
+    """Yield each frame with its photoelectron rates; repeated frames share the array."""
+    of_one_frame = camera.replace(n_threads=1) if ahead else camera
+    image_lock = Lock()
+    warned: set[str] = set()
+
+    def compute(task: Task) -> tuple[Task, Floats | None, Clock]:
+        own = Clock()
+        if task.is_repeated:
+            return task, None, own
+        # The first frame of a scene computes the images that its next frames share.
+        with image_lock if task.images == {} and camera.axis == "image" else nullcontext():
+            gaze_um = task.position_um if task.is_moving else None
+            return task, expected_rates(of_one_frame, task.light, own, gaze_um, task.images, warned), own
+
+    rate_e_per_s = np.zeros(camera.layout.n_sites)
+    for task, found, own in in_order(compute, tasks(frames), camera.n_threads, ahead):
+        rate_e_per_s = rate_e_per_s if found is None else read_only(found)
+        clock.add(own)
+        yield task, rate_e_per_s
