@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Limits, OwnCheck, Usual, check_declared, declarations_of
+from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Limits, OwnCheck, Usual, check_declared
 from foveasim._core.names import CHANNEL_LETTERS, find_wrong_letter, possible_names
-from foveasim._core.provenance import is_digest, large_arrays, resolve
+from foveasim._core.provenance import large_arrays
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import drawn
 from foveasim._core.threads import cached_property
@@ -30,9 +30,7 @@ from foveasim._core.validation import (
     wavelengths_nm,
 )
 from foveasim.errors import ParameterError, SimulationError, format_value, type_name
-from foveasim.incidence import ChiefRayTable
 from foveasim.sensor.adc import ADC, BITS, DNL, INL, LOG_STRENGTH, Companding, ConversionTables
-from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.chain import (
     ChargeCheck,
     Conversion,
@@ -49,8 +47,8 @@ from foveasim.sensor.chain import (
     sort_by_stage,
 )
 from foveasim.sensor.device import Device
-from foveasim.sensor.effects import EFFECTS, Collection, Effect, Photosites, Sites, Stage
-from foveasim.sensor.effects.contract import NOTHING, FixedFactor, FixedOffset
+from foveasim.sensor.effects import Collection, Effect, Photosites, Sites, Stage
+from foveasim.sensor.effects.contract import FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING, DarkLaw, DarkSignal, HotSites, dark_current_factor
 from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
@@ -69,18 +67,14 @@ from foveasim.sensor.limits import (
     WIDE_SPREAD,
 )
 from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET, PERCENTILE, TARGET, exposure_for
+from foveasim.sensor.model.codes import predict, predict_covariance
 from foveasim.sensor.model.inversion import Inverse, invert, invert_collection
-from foveasim.sensor.model.linearisation import QUANTISATION, Linearisation, linearise
+from foveasim.sensor.model.linearisation import Linearisation, linearise
 from foveasim.sensor.model.prediction import (
-    NO_TABLES,
-    ChargeDistributions,
-    ChargeTables,
     ReadoutModel,
-    Transfer,
-    clipped_gaussian_moments,
 )
 from foveasim.sensor.model.records import Record, light_records, map_light, readout_model
-from foveasim.sensor.pixel_optics import PIXEL_OPTICS, Outlines, PixelOptics
+from foveasim.sensor.pixel_optics import PixelOptics
 from foveasim.sensor.presets import find_preset
 from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
 from foveasim.sensor.spectral.response import FilterSet, rgb_filters
@@ -91,11 +85,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PerSite", "Photosites", "Sensor"]
 
-#: Offset of voltages for the slope of mean codes, in standard deviations of the noise: the error is below 1e-3; and smallest
-#: noise to which it is relative, in units of the range.
-OFFSET_SIGMAS, SMALLEST_NOISE = 0.05, 1e-9
-#: Fraction of its own charge that a site keeps in a mixing, above which this charge has its own distribution in predictions.
-MIN_OWN_FRACTION = 0.5
 #: Parameters that depend on the wavelength, which the settings of captures do not restore.
 SPECTRAL = ("qe", "filters")
 #: One value for all sites, or an array (n_site,).
@@ -371,21 +360,9 @@ class Sensor:
             If a parameter whose default is not 0 or None is missing, an array is missing in ``arrays``, or an effect is not
             registered.
         """
-        kinds: tuple[Any, ...] = (
-            Diffusion, KernelCrosstalk, InterPixelCapacitance, ShotNoise, *EFFECTS.values(), *PIXEL_OPTICS.values(), Outlines,
-            ChiefRayTable,
-        )  # fmt: skip
-        classes = {kind.__name__: kind for kind in kinds}
-        values: dict[str, Any] = {}
-        for parameter in fields(cls):
-            name = parameter.name
-            if name in SPECTRAL or name == "layout":
-                continue
-            if name not in settings and parameter.default:
-                raise ParameterError("sensor", f"must be given: the settings of the capture do not contain {name!r}")
-            if name in settings:
-                values[name] = _object(classes, name, settings[name], arrays or {})
-        return cls(layout, **values)
+        from foveasim.sensor.restored import values_of
+
+        return cls(layout, **values_of(cls, settings, arrays or {}))
 
     @cached_property
     def arrays(self) -> Mapping[str, NDArray[Any]]:
@@ -583,36 +560,9 @@ class Sensor:
         ParameterError
             If effects, such as crosstalk, connect sites with others, or an index is not that of a site.
         """
-        self._check_local()
-        chosen = selection
-        if not isinstance(selection, slice) or not _is_range(selection):
-            try:
-                chosen = np.arange(self.layout.n_sites)[selection]
-                if chosen.ndim != 1:
-                    raise IndexError
-            except (IndexError, TypeError, ValueError):
-                rule = f"must be a slice, or a list of indices of the {self.layout.n_sites} sites"
-                raise ParameterError("selection", rule, selection) from None
-        values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(Sensor)}
-        per_site = (name for name, declared in declarations_of(Sensor).items() if declared.is_per_site)
-        values |= {name: values[name][chosen] for name in per_site if np.ndim(values[name])}
-        if self.pixel_optics is not None:
-            values["pixel_optics"] = self.pixel_optics.part(chosen)
-        return SensorPart(**values | {"layout": self.layout[chosen]}, _complete=self, _selection=chosen)
+        from foveasim.sensor.part import part_of
 
-    def _check_local(self) -> None:
-        connecting = ", ".join(repr(effect.name) for effect in self.chain if effect.reach == "all")
-        if connecting:
-            raise ParameterError(
-                "sensor",
-                f"must have no effects between sites to be divided, got {connecting}",
-                hint=f"switch them off: sensor.without({connecting})",
-            )
-        if self.pixel_optics is not None and self.pixel_optics.has_mixing:
-            raise ParameterError(
-                "pixel_optics",
-                "must not mix the light of sites in a sensor to be divided; use pixel optics without crosstalk",
-            )
+        return part_of(self, selection)
 
     @property
     def _own_collection(self) -> Collection | None:
@@ -1018,6 +968,11 @@ class Sensor:
     def _tables(self) -> ConversionTables:
         return self.adc.tables(self.v_sat_v, self.device.key("dnl")[0])
 
+    @property
+    def conversion_tables(self) -> tuple[NDArray[np.int32], ConversionTables]:
+        """Readout lines and tables of the ADC, for kernels."""
+        return self._line, self._tables
+
     def _check_size(self, name: str, charge_e: ArrayLike) -> NDArray[Any]:
         return check_per_site(name, np.asarray(unmasked(name, charge_e)), self.layout.n_sites)
 
@@ -1193,7 +1148,7 @@ class Sensor:
         A collection of a user has the sums over its probabilities (:meth:`~foveasim.sensor.effects.Collection.table`).
         """
         expected_e = self.validate_charges("expected_e", expected_e)
-        return self._predict(expected_e, self._sites_during(exposure_s), 0.0, n_threads)
+        return predict(self, expected_e, self._sites_during(exposure_s), n_threads=n_threads)
 
     def predict_covariance(
         self, expected_e: Floats, sites: ArrayLike, *, exposure_s: Annotated[float | None, EXPOSURE] = None
@@ -1221,116 +1176,8 @@ class Sensor:
         in the correlation with positive coefficients: a lower bound where codes are few, as for one bit, and the covariance
         where noise spans at least one code.
         """
-        charge_e, during = self.validate_charges("expected_e", expected_e), self._sites_during(exposure_s)
-        model = self.linearise(charge_e, exposure_s=exposure_s)
-        covariance = model.covariance_matrix_dn2(sites)
-        index = np.asarray(sites)
-        # The mean code for small offsets of the voltage at the ADC.
-        before = [name for name, kind in model.sources.items() if kind != "fixed" and name != QUANTISATION]
-        noise_v = np.sqrt(model.variance_dn2(before)) / model.slope_dn_per_v
-        offset_v = OFFSET_SIGMAS * np.broadcast_to(np.maximum(noise_v, SMALLEST_NOISE * self.v_sat_v), charge_e.shape)
-        (ahead_dn, _), (behind_dn, _) = (self._predict(charge_e, during, each) for each in (offset_v, -offset_v))
-        smooth = ((ahead_dn - behind_dn) / (2.0 * offset_v * model.slope_dn_per_v))[index]
-        covariance *= np.multiply.outer(smooth, smooth)
-        np.fill_diagonal(covariance, self._predict(charge_e, during)[1][index])
-        return covariance
-
-    def _predict(
-        self, expected_e: Floats, sites: Sites, offset_v: Floats | float = 0.0, n_threads: int | None = None
-    ) -> tuple[Floats, Floats]:
-        """Compute mean and variance of the codes, with an offset of the voltages at the ADC."""
-        from foveasim.sensor import _kernels
-
-        mean_dn, variance_dn2 = np.empty(expected_e.size), np.empty(expected_e.size)
-        well_e, collection = self.well_e, self.collection
-        is_drawn, is_poisson = collection.is_drawn, isinstance(collection, ShotNoise)
-        drawn_e, drawn_e2 = collection.validate_moments(expected_e, NOTHING, sites)
-        if not is_drawn:
-            drawn_e, drawn_e2 = np.minimum(np.rint(drawn_e), well_e), np.zeros(1)
-        collected_e, collected_e2 = clipped_gaussian_moments(drawn_e, drawn_e2, well_e)
-        model = self.readout_model(collected_e, collected_e2)
-        transfer, noise_e2, half_step_e = model.transfer, model.gaussian_e2, model.half_step_e
-        own = model.own_fraction
-        if own is not None and own.size and own.min() > MIN_OWN_FRACTION:
-            # The own charge has its distribution; charges of other sites are Gaussian.
-            others_e = model.mean_e - own * collected_e
-            others_e2 = np.maximum(model.variance_e2 - own**2 * collected_e2, 0.0)
-            transfer = transfer._replace(
-                v_per_e=transfer.v_per_e * own, sense_v=transfer.sense_v + transfer.v_per_e * others_e
-            )
-            noise_e2, half_step_e = (noise_e2 + others_e2) / own**2, half_step_e / own
-        elif model.is_mixed:
-            # Mixed charges, after clipping at the full well, are approximated as Gaussian.
-            drawn_e, drawn_e2 = model.mean_e, model.variance_e2
-            is_drawn, well_e = False, np.array([np.inf])
-        charges = ChargeDistributions(
-            mean_e=drawn_e,
-            variance_e2=drawn_e2,
-            well_e=well_e,
-            sigma_e=np.sqrt(noise_e2),
-            half_step_e=half_step_e,
-            is_drawn=is_drawn,
-        )
-        transfer = transfer._replace(output_v=np.asarray(transfer.output_v + offset_v))
-
-        def block(_: int, index: slice) -> None:
-            chosen = sites.block(index)
-
-            def part(values: Any) -> Any:
-                return read_only(chosen.select(values).view()) if isinstance(values, np.ndarray) else values
-
-            tables = NO_TABLES
-            if is_drawn and not is_poisson:
-                first, probability, offsets = collection.table(expected_e[index], sites=chosen.of(collection))
-                tables = ChargeTables(*map(read_only, (first, offsets, probability)))
-            _kernels.predict_codes(
-                ChargeDistributions(*map(part, charges)),
-                tables,
-                Transfer(*map(part, transfer)),
-                part(self._line),
-                self._tables,
-                mean_dn[index],
-                variance_dn2[index],
-            )
-
-        for_each_block(expected_e.size, block, n_threads)
-        return mean_dn, variance_dn2
-
-
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class SensorPart(Sensor):
-    """
-    Some of the sites of a sensor, such as a tile.
-
-    Their fixed patterns and effects are those that they have in the complete sensor. Created by :meth:`Sensor.part`.
-    """
-
-    #: Sensor with all sites, whose layout the effects use, and indices of the sites of the part.
-    _complete: Sensor
-    _selection: slice | Ints
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.device_seed != self._complete.device_seed:
-            raise ParameterError(
-                "device_seed",
-                f"must be {self._complete.device_seed} in part of a sensor",
-                self.device_seed,
-                hint="change it in the complete sensor",
-            )
-        n_sites = self._complete.sites.block(self._selection).n_sites
-        if self.layout.n_sites != n_sites:
-            raise ParameterError("layout", f"must have the {n_sites} sites of the part, got {self.layout.n_sites}")
-        self._check_local()
-
-    @cached_property
-    def device(self) -> Device:
-        """Source of the fixed patterns."""
-        return self._complete.device.part(self._selection, self.layout)
-
-    @property
-    def _complete_sites(self) -> tuple[Sites, slice | Ints]:
-        return self._complete.sites, self._selection
+        charges = self.validate_charges("expected_e", expected_e)
+        return predict_covariance(self, charges, sites, self._sites_during(exposure_s), exposure_s)
 
 
 def _means(name: str, values: ArrayLike, n_sites: int) -> Floats:
@@ -1341,37 +1188,3 @@ def _means(name: str, values: ArrayLike, n_sites: int) -> Floats:
     if array.size and not (smallest := float(array.min())) >= 0.0:
         raise ParameterError(name, "must be >= 0 everywhere", smallest)
     return np.broadcast_to(array, (n_sites,)) if array.shape == (1,) else array
-
-
-def _is_range(selection: slice) -> bool:
-    """Whether a slice has integer bounds and no step."""
-    bounds = selection.start, selection.stop
-    return selection.step in (None, 1) and all(bound is None or isinstance(bound, int) for bound in bounds)
-
-
-def _object(classes: Mapping[str, Any], name: str, data: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
-    """Create the effect objects that plain data describe; return other data unchanged."""
-    if is_digest(data):
-        values_of = resolve(data, arrays)
-        if values_of is None:
-            raise ParameterError(
-                "sensor", f"must be given: the settings of the capture do not contain all values of {name!r}"
-            )
-        return values_of
-    if isinstance(data, list):
-        return [_object(classes, f"{name}[{k}]", item, arrays) for k, item in enumerate(data)]
-    if not isinstance(data, Mapping):
-        return data
-    values = {key: _object(classes, f"{name}.{key}", item, arrays) for key, item in data.items() if key != "kind"}
-    if "kind" not in data:
-        return values  # a parameter of an effect
-    kind = str(data["kind"])
-    if kind not in classes:
-        raise ParameterError("sensor", f"cannot be restored: effect {kind!r} is not registered; pass sensor=")
-    parameters = {each.name: each.init for each in fields(classes[kind])}
-    unknown = next((key for key in values if key not in parameters), None)
-    if unknown is not None:
-        raise ParameterError(
-            "sensor", f"cannot be restored: effect {kind!r} has no parameter {unknown!r} any more; pass sensor="
-        )
-    return classes[kind](**{key: value for key, value in values.items() if parameters[key]})
