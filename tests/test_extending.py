@@ -68,6 +68,11 @@ rows, _ = requirements(SimpleNamespace(shot=limited, capture=capture))
 demo = {key: each for key, each in fs.config.read_settings(fs.config.demo_settings()[0]).items() if key != "sensor"}
 choices = [each for control in controls_of(demo) if control["id"] == "layout" for each in control["choices"]]
 chosen = next(each["value"] for each in choices if each["label"] == "daisy")
+petal = next(each for each in controls_of({**demo, "layout": chosen}) if each["key"].endswith("petal_um"))
+try:
+    fs.layout.daisy(n_petals=12, petal_um=300.0)
+except fs.errors.ParameterError as error:
+    too_large = str(error)
 uses = {
     "generator in the studio": fs.config.build_shot(None, {**demo, "layout": chosen}).camera.layout.n_sites > 3,
     "sweep": swept[name].values.tolist()[1] >= 0,
@@ -77,6 +82,7 @@ uses = {
     "comparison": compared.values[name][0, 0] == capture.code.min() and "lowest code" in open("report.html").read().lower(),
     "studio": {"name": name, "label": "lowest code / DN", "unit": "DN", "has_region": True, "is_cost": False} in rows["measures"],
     "schema": name in json.dumps(fs.explore.schema_of("sweep")),
+    "declared parameter": (petal["label"], petal["suggested"], too_large) == ("petal radius", [1.0, 20.0], "'petal_um' must be <= 100, got 300.0 µm"),
     "column": "charge_density" in capture.to_pandas() and "charge_density" in json.dumps(fs.explore.schema_of("dataset")),
 }
 print(json.dumps({
@@ -119,6 +125,7 @@ def test_installed_package_extends_every_kind(extended):
         "uses": [
             "column",
             "comparison",
+            "declared parameter",
             "generator in the studio",
             "goal seek",
             "requirement",

@@ -6,7 +6,7 @@ Each section names a call of the package and its parameters: file and Python hav
 
 from __future__ import annotations
 
-from foveasim._core.calls import publish
+from foveasim._core.calls import Limits, Usual, Words, publish
 from foveasim.config._comparing import compare_files
 from foveasim.config._objects import (
     YAML_EXTENSIONS,
@@ -48,12 +48,15 @@ __all__ = [
     "STARTING_FILES",
     "YAML_EXTENSIONS",
     "LayoutFile",
+    "Limits",
     "RegionResult",
     "Requirement",
     "Result",
     "Shot",
     "Source",
+    "Usual",
     "Viewable",
+    "Words",
     "build_shot",
     "bundled_layouts",
     "check_directory",

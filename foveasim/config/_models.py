@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import lru_cache
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_type_hints
 
@@ -80,7 +81,7 @@ def _field(name: str, default: Any, description: str | None, declared: Declarati
     """Return a key with its unit and range, which the call checks: its messages have hints."""
     default = ... if default is inspect.Parameter.empty else default
     limits = declared.limits
-    if limits is None and declared.usual is None:
+    if limits is None and declared.usual is None and declared.words is None:
         return Field(default, description=description)
     rule = {} if limits is None else limits.schema
     words = "" if limits is None else f"{limits.range} {unit_of(name)}".strip()
@@ -90,6 +91,8 @@ def _field(name: str, default: Any, description: str | None, declared: Declarati
         extra["items"] = {"type": "number", **rule}
     if declared.usual is not None:
         extra["usual"] = list(declared.usual)
+    if declared.words is not None:
+        extra["words"] = asdict(declared.words)
     return Field(default, description=f"{description or ''} {note}".strip(), json_schema_extra=extra)
 
 

@@ -150,5 +150,6 @@ def public_objects(directory):
         reconstruct.ColourCorrection(np.eye(3), np.zeros(24), np.zeros(24)),
         reconstruct.CorticalImage(data=np.ones((1, 20, 30)), radius_um=np.arange(21.0), start_rad=np.zeros(20)),
         tiles.TiledCapture(columns={"code": MANY}, tile_sites=500, filter_names=("all",), bits=8, white_dn=np.ones(1), settings={}, path=Path("large.zarr")),
+        fs.columns.column_info("snr"), config.Limits(above=0.0), config.Usual(0.0, 1.0), config.Words("petal radius"),
         dataset, explore.DatasetFile(dataset=dataset, per_shard=None), explore.open_dataset(directory / "samples"),
     ]  # fmt: skip

@@ -51,6 +51,12 @@ class Limits:
         Smallest plausible value besides 0: smaller ones indicate errors of units or digits.
     hint : str
         Reminder of the unit, for error messages.
+
+    Examples
+    --------
+    >>> from foveasim.config import Limits
+    >>> Limits(above=0.0, at_most=100.0).range
+    'above 0, at most 100'
     """
 
     above: float | None = None
@@ -139,10 +145,52 @@ class Limits:
 
 
 class Usual(NamedTuple):
-    """Range of most devices, for sliders: ``Annotated[float, Limits(...), Usual(low, high)]``."""
+    """
+    Range of most devices, for sliders: ``Annotated[float, Limits(...), Usual(low, high)]``.
+
+    Attributes
+    ----------
+    low, high : float
+        Ends of the slider, which are not limits.
+
+    Examples
+    --------
+    >>> from foveasim.config import Usual
+    >>> Usual(1.0, 20.0).high
+    20.0
+    """
 
     low: float
     high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """
+    Words of a parameter on pages: ``Annotated[float, Limits(...), Words("read noise")]``.
+
+    Attributes
+    ----------
+    label : str
+        Name on the page; by default that of the parameter.
+    help : str
+        Sentence; by default that of the docstring.
+    unit : str
+        By default that of the name.
+    synonyms : str
+        Further words that the search finds.
+
+    Examples
+    --------
+    >>> from foveasim.config import Words
+    >>> Words("petal radius").label
+    'petal radius'
+    """
+
+    label: str = ""
+    help: str = ""
+    unit: str = ""
+    synonyms: str = ""
 
 
 FINITE = Limits()
@@ -156,11 +204,12 @@ LENGTH = Limits(above=0.0, at_least=MIN_LENGTH_UM, at_most=MAX_LENGTH_UM, hint="
 
 
 class Declaration(NamedTuple):
-    """Declaration of a parameter: types of values, without None, with their arguments; ranges."""
+    """Types of values of a parameter, without None, with their arguments; ranges, words."""
 
     kinds: dict[Any, tuple[Any, ...]]
     limits: Limits | None = None
     usual: Usual | None = None
+    words: Words | None = None
     is_optional: bool = False
 
     @classmethod
@@ -174,6 +223,8 @@ class Declaration(NamedTuple):
                     found = found._replace(limits=note)
                 elif isinstance(note, Usual):
                     found = found._replace(usual=note)
+                elif isinstance(note, Words):
+                    found = found._replace(words=note)
             return found
         if get_origin(annotation) not in (Union, UnionType):
             if annotation is NoneType:
@@ -184,6 +235,7 @@ class Declaration(NamedTuple):
             {kind: arguments for part in parts for kind, arguments in part.kinds.items()},
             next((part.limits for part in parts if part.limits), None),
             next((part.usual for part in parts if part.usual), None),
+            next((part.words for part in parts if part.words), None),
             any(part.is_optional for part in parts),
         )
 

@@ -269,7 +269,7 @@ def _described(key: str, section: str, node: dict[str, Any]) -> dict[str, Any]:
     """Return the name, unit and help of a control."""
     name = key.rpartition(".")[2]
     label, unit = words_and_unit(name)
-    words = words_of(key)
+    words = words_of(key, node)
     found = _sentence(_plain(node.get("description", "")))
     return {
         "key": key,

@@ -1,24 +1,11 @@
-"""Names, help and further search words of settings on the page."""
+"""Names, help and search words of settings whose declarations contain none."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import Any
 
-
-@dataclass(frozen=True)
-class Words:
-    """
-    Words of a setting.
-
-    ``label``: name on the page, ``help``: sentence, ``unit``: unit; empty ones are those of the schema. ``synonyms``: further
-    words that the search finds.
-    """
-
-    label: str = ""
-    help: str = ""
-    unit: str = ""
-    synonyms: str = ""
-
+from foveasim._core.calls import Words
 
 #: Words by the last name of a setting, or by its last two for a name with several meanings.
 WORDS: dict[str, Words] = {
@@ -217,6 +204,7 @@ WORDS: dict[str, Words] = {
     "rules.grid_um": Words("manufacturing grid"),
     "scene": Words("scene", synonyms="photograph chart cube light"),
     "seed": Words("seed of the noise", "Seed of the temporal noise: equal seeds give equal noise.", synonyms="random"),
+    "parameters.seed": Words("seed"),
     "random_channels.seed": Words("seed", "Seed of the random filters."),
     "sensitivity": Words(synonyms="fill factor microlens"),
     "sensor": Words("sensor", synonyms="electronics pixel"),
@@ -242,7 +230,9 @@ WORDS: dict[str, Words] = {
 }
 
 
-def words_of(key: str) -> Words:
-    """Return the words of the setting with a path."""
+def words_of(key: str, node: Mapping[str, Any]) -> Words:
+    """Return the words of the setting with a path: those of its declaration, or of its name."""
+    if "words" in node:
+        return Words(**node["words"])
     names = [name for name in key.split(".") if not name.isdecimal()]
     return WORDS.get(".".join(names[-2:])) or WORDS.get(names[-1]) or Words()

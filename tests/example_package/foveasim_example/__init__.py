@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import shapely
@@ -11,6 +12,7 @@ from scipy.special import bdtr
 
 import foveasim as fs
 from foveasim.columns import COLUMNS, ColumnInfo
+from foveasim.config import Limits, Usual, Words
 from foveasim.distortion import LENSES
 from foveasim.layout import DERIVED_LAYERS, FORMATS, RULES, FileFormat, Rule, WrittenLayout, layout_edit, layout_family
 from foveasim.maps import MAP_FORMATS, Found
@@ -23,7 +25,11 @@ from foveasim.sensor.spectral import CURVES
 
 
 @layout_family(example={"n_petals": 12, "petal_um": 3.0})
-def daisy(*, n_petals: int, petal_um: float) -> fs.Layout:
+def daisy(
+    *,
+    n_petals: Annotated[int, Limits(at_least=3, at_most=1000)],
+    petal_um: Annotated[float, Limits(above=0.0, at_most=100.0), Usual(1.0, 20.0), Words("petal radius")],
+) -> fs.Layout:
     """A disc with a ring of discs around it."""
     angle = 2.0 * np.pi * np.arange(n_petals) / n_petals
     ring_um = petal_um / np.sin(np.pi / n_petals)
