@@ -149,7 +149,7 @@ def of_jobs(directory: Path) -> dict[str, Any]:
         options = {"frequency_per_mm": 40.0} if name == "mtf" else {}
         one = fs.config.build_shot(None, {**SMALL, "layout": {**SMALL["layout"], "rules": {"min_size_um": 6.0}}})
         capture = one.camera.capture(one.scene, exposure_s=0.01, seed=5)
-        found[f"result {name}"] = fs.explore.measure(fs.config.RegionResult(measure=name, **options), one, capture)
+        found[f"result {name}"] = fs.explore.result_of(fs.config.RegionResult(measure=name, **options), one, capture)
     return found
 
 

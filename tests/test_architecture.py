@@ -10,6 +10,7 @@ import sys
 from collections import Counter
 from dataclasses import fields
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -213,6 +214,22 @@ def test_circles_of_imports_stay_in_one_package():
 
     assert [found for found in packages if len(found) > 1] == []
     assert n_circles > 100  # otherwise no circle could be found
+
+
+def test_modules_are_not_imported_in_circles():
+    """Imports within functions excepted: those of a package's parts happen when they are used."""
+
+    def at_import(path):
+        body = [node for node in parsed(path).body if not isinstance(node, ast.FunctionDef | ast.ClassDef)]
+        return set(imports_of(ast.Module(body, [])))
+
+    names = {module_name(path): path for path in MODULES}
+    graph = {name: at_import(path) & names.keys() - {name} for name, path in names.items()}
+    order = list(TopologicalSorter(graph).static_order())
+
+    assert len(order) == len(MODULES)
+    with pytest.raises(CycleError):
+        list(TopologicalSorter(graph | {"foveasim.errors": {"foveasim.camera"}}).static_order())
 
 
 def test_nothing_heavy_is_loaded_by_import():

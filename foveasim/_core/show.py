@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import inspect
-import re
 from collections.abc import Callable
 from importlib import import_module
 from types import MethodType
 from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, overload
+
+from foveasim._core.calls.docstrings import Docstring
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from pyvista import PolyData  # noqa: TID251 -- a type alone
 
 R = TypeVar("R")
-#: First parameter of a numpydoc section, with its description.
-FIRST_PARAMETER = re.compile(r"(\n *Parameters\n *-+\n)( *)\S.*\n(?:\2 +.*\n|\n(?=\2 ))*")
-NO_PARAMETERS = re.compile(r"\n *Parameters\n *-+\n(?=\s*(\n *\w+\n *-+\n|$))")
 
 
 def load(module: str) -> Any:
@@ -44,15 +42,9 @@ def _signature(function: Callable[..., Any]) -> inspect.Signature:
     )
 
 
-def _docstring(function: Callable[..., Any]) -> str:
-    """Return the docstring of a method: without the first parameter."""
-    text = FIRST_PARAMETER.sub(r"\1", inspect.getdoc(function) or "", count=1)
-    return NO_PARAMETERS.sub("", text)
-
-
 class Drawn(Generic[R]):
     __doc__ = _OfFunction(
-        _docstring,
+        lambda function: Docstring.of(function).without_first_parameter(),
         "Method that is a function of :mod:`foveasim.view`; created by :func:`drawn`.",
     )
     __signature__: Any = _OfFunction(

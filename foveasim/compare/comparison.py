@@ -31,7 +31,7 @@ from foveasim.compare.annuli import quality_by_eccentricity
 from foveasim.compare.budgets import BUDGETS, Budget, budget_of, budget_rows, check_equal_budgets
 from foveasim.compare.information import scene_covariance
 from foveasim.compare.intervals import MedianInterval, median_interval
-from foveasim.compare.measure import (
+from foveasim.compare.metrics import (
     BY_ECCENTRICITY,
     COMPARED,
     ComparedShot,

@@ -13,7 +13,7 @@ from foveasim._core.quantities import format_quantity
 from foveasim.compare.budgets import BUDGETS, budget_rows
 from foveasim.compare.figures import draw_measure, draw_sizes, figure_of
 from foveasim.compare.intervals import MIN_SCENES
-from foveasim.compare.measure import best_cameras, metric_rows
+from foveasim.compare.metrics import best_cameras, metric_rows
 from foveasim.metrics.registry import metric_info
 from foveasim.reconstruct import Picture
 from foveasim.view.web._report_page import (

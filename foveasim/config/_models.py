@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_type_hints
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 
 from foveasim._core.calls import NOT_NEGATIVE, Declaration, Usual
+from foveasim._core.calls.docstrings import Docstring
 from foveasim._core.registry import Registry
 from foveasim._core.validation import unit_of
 from foveasim.camera import GazeAxis
@@ -63,7 +64,8 @@ class Section(BaseModel):
 def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **types: Any) -> type[Section]:
     """Return a model with the parameters of a call, with file types for some."""
     hints = get_type_hints(call, include_extras=True)
-    summary, descriptions = _documentation(call)
+    documented = Docstring.of(call)
+    descriptions = documented.parameters
     keys: dict[str, Any] = {
         p.name: (
             types.get(p.name, hints.get(p.name)),
@@ -72,7 +74,7 @@ def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **type
         for p in inspect.signature(call).parameters.values()
         if p.name not in skip
     }
-    model = create_model(name, __base__=Section, __doc__=summary, **keys)
+    model = create_model(name, __base__=Section, __doc__=documented.summary, **keys)
     _CALLS[model] = call
     return model
 
@@ -100,19 +102,6 @@ def call_of(section: BaseModel | type[BaseModel]) -> Callable[..., Any] | None:
     """Return the call of a section or of its model; None if it only contains values."""
     model = section if isinstance(section, type) else type(section)
     return next((_CALLS[kind] for kind in model.__mro__ if kind in _CALLS), None)
-
-
-def _documentation(call: Callable[..., Any]) -> tuple[str, dict[str, str]]:
-    """Return the summary of a numpydoc docstring, and the description of each parameter."""
-    text = inspect.getdoc(call) or ""
-    descriptions: dict[str, str] = {}
-    names: list[str] = []
-    for line in text.partition("Parameters\n----------\n")[2].split("\n\n")[0].splitlines():
-        if line.startswith("    "):
-            descriptions.update({name: f"{descriptions.get(name, '')} {line.strip()}".strip() for name in names})
-        else:
-            names = [name.strip() for name in line.partition(" : ")[0].split(",")]
-    return text.split("\n\n")[0].replace("\n", " "), descriptions
 
 
 def _union_of(tag: str, models: Mapping[str, type[Section]]) -> Any:
@@ -411,7 +400,7 @@ def _layout_union(title: str, base: type[LayerSection], parameters: Mapping[str,
     base.__doc__ = (
         "A layout: a generator and its parameters, colour filters, edits in the order of the keys, design rules."
     )
-    descriptions = _documentation(read_layout)[1]
+    descriptions = Docstring.of(read_layout).parameters
     options: dict[str, Any] = {
         name: (kind, Field(None, description=descriptions.get(name))) for name, kind in FILE_OPTIONS.items()
     }

@@ -17,7 +17,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._io.atomic import atomic_files
 from foveasim._io.terminal import as_plain_text
 from foveasim.capture import Capture
-from foveasim.config import Shot
+from foveasim.config._objects import Shot
 from foveasim.errors import FileError, printable
 from foveasim.layout import Layout, Report
 from foveasim.reconstruct.picture import NO_DATA_COLOUR

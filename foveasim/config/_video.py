@@ -10,7 +10,7 @@ from typing import Any
 
 from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.threads import thread_count
-from foveasim.config import Shot
+from foveasim.config._objects import Shot
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.scene import Scene

@@ -11,7 +11,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._io.zarr_stores import store_format
 from foveasim.capture import Capture
 from foveasim.columns import STORED
-from foveasim.config import read_any_layout, read_rules
+from foveasim.config._objects import read_any_layout, read_rules
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.layout import Layout, Report
 from foveasim.layout.drc.report import is_lyrdb, read_lyrdb

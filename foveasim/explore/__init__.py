@@ -11,7 +11,7 @@ from foveasim.explore.datasets.plan import DatasetFile, read_dataset
 from foveasim.explore.datasets.pytorch import torch_dataset
 from foveasim.explore.datasets.recipes import classification, denoising
 from foveasim.explore.datasets.store import StoredSamples, open_dataset, write_dataset
-from foveasim.explore.requirements import CheckedRequirement, ResultMetric, check_requirements, measure
+from foveasim.explore.requirements import CheckedRequirement, ResultMetric, check_requirements, result_of
 from foveasim.explore.solving import Solution, solve
 from foveasim.explore.studies.plan import StudyPlan, plan_study, read_study
 from foveasim.explore.studies.study import best_table, run_study, storage_name, study
@@ -35,7 +35,6 @@ __all__ = [
     "denoising",
     "finished_trials",
     "import_metric",
-    "measure",
     "open_dataset",
     "open_results",
     "parse_distribution",
@@ -44,6 +43,7 @@ __all__ = [
     "read_dataset",
     "read_study",
     "read_sweep",
+    "result_of",
     "run_study",
     "run_sweep",
     "schema_of",

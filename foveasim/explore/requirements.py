@@ -11,7 +11,7 @@ from foveasim.capture import Capture
 from foveasim.config import RegionResult, Requirement, Shot
 from foveasim.metrics.registry import METRICS, MetricInfo, number_of, sites_of
 
-__all__ = ["CheckedRequirement", "ResultMetric", "check_requirements", "measure"]
+__all__ = ["CheckedRequirement", "ResultMetric", "check_requirements", "result_of"]
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,10 @@ def check_requirements(shot: Shot, capture: Capture) -> list[CheckedRequirement]
     >>> [checked.is_met for checked in fs.explore.check_requirements(shot, capture)]
     [True, False]
     """
-    return [CheckedRequirement(requirement, measure(requirement, shot, capture)) for requirement in shot.requirements]
+    return [CheckedRequirement(requirement, result_of(requirement, shot, capture)) for requirement in shot.requirements]
 
 
-def measure(result: RegionResult, shot: Shot, capture: Capture) -> float:
+def result_of(result: RegionResult, shot: Shot, capture: Capture) -> float:
     """
     Return the value of a result, such as that of a requirement.
 
@@ -94,7 +94,7 @@ def measure(result: RegionResult, shot: Shot, capture: Capture) -> float:
     >>> import foveasim as fs
     >>> shot = fs.config.read_shot(fs.config.demo_settings()[0])
     >>> capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=0)
-    >>> round(fs.explore.measure(fs.config.RegionResult(measure="smallest_size_um"), shot, capture), 1)
+    >>> round(fs.explore.result_of(fs.config.RegionResult(measure="smallest_size_um"), shot, capture), 1)
     6.0
     """
     region = result if result.has_region else None
@@ -130,7 +130,7 @@ class ResultMetric:
 
     def __call__(self, shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG002 -- the signature of metrics
         """Return the value of the result."""
-        return measure(self.result, shot, capture)
+        return result_of(self.result, shot, capture)
 
 
 @METRICS.register("requirements", info=MetricInfo(title="requirements", is_number=False))

@@ -12,7 +12,7 @@ from typing import Any
 from foveasim._core.short_repr import short_repr
 from foveasim.config import Requirement, Source, get_setting, put_setting, read_settings
 from foveasim.errors import FoveasimError, ParameterError, SimulationError
-from foveasim.explore.requirements import measure
+from foveasim.explore.requirements import result_of
 from foveasim.explore.sweeps.plan import copy_settings, takes_integers
 from foveasim.explore.worker_cache import ShotRunner
 from foveasim.metrics.registry import metric_info
@@ -107,7 +107,7 @@ def solve(
     def result_at(value: float) -> float:
         changed = copy_settings(settings)
         put_setting(source, changed, setting, value)
-        return measure(requirement, *runner.simulate_capture(changed))
+        return result_of(requirement, *runner.simulate_capture(changed))
 
     present = _number_at(settings, setting, bounds)
     is_integer = takes_integers(source, settings, setting)

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 
 from foveasim._core.calls import Limits, check_arguments
+from foveasim._core.calls.docstrings import Docstring
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.registry import Registry
 from foveasim._core.validation import MAX_SITES
@@ -107,7 +108,7 @@ def layout_family(
 
 def summary_of(generator: Callable[..., Layout]) -> str:
     """Return the first sentence of the docstring of a generator, without markup and full stop."""
-    summary = (generator.__doc__ or "").strip().split("\n\n")[0].split(". ")[0]
+    summary = Docstring.of(generator).summary.split(". ")[0]
     return " ".join(summary.replace("``", "").split()).rstrip(".")
 
 

@@ -13,6 +13,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from foveasim._core.calls.docstrings import Docstring
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, check_choice, words_and_unit
@@ -136,7 +137,7 @@ class MetricInfo:
 #: ``@METRICS.register(name, info=MetricInfo(...))``, and have defaults. Installed packages add metrics as entry points of the
 #: group ``foveasim.metrics``.
 METRICS: Registry[Metric] = Registry(
-    "metric", "foveasim.metrics", modules=("foveasim.compare.measure", "foveasim.explore.requirements")
+    "metric", "foveasim.metrics", modules=("foveasim.compare.metrics", "foveasim.explore.requirements")
 )
 
 
@@ -149,7 +150,7 @@ def metric_info(name: str) -> MetricInfo:
     function = METRICS.find("metric", name)
     found: MetricInfo = METRICS.info(name) or MetricInfo()
     words, unit = words_and_unit(name)
-    summary = (inspect.getdoc(function) or "").partition("\n")[0]
+    summary = Docstring.of(function).summary
     return replace(
         found,
         title=found.title or words,

@@ -22,7 +22,7 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.yaml_files import format_yaml
 from foveasim.config import Requirement, check_settings, put_setting, validate
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
-from foveasim.explore import measure
+from foveasim.explore import result_of
 from foveasim.explore.solving import search_value
 from foveasim.layout import Layout
 from foveasim.metrics import metric_info
@@ -641,7 +641,7 @@ class Session:
             n_done += 1
             self._check(f"goal seek, step {n_done}")
             result = self.engine.simulate(changed(value))
-            return measure(requirement, result.shot, result.capture)
+            return result_of(requirement, result.shot, result.capture)
 
         solution = search_value(
             key, present, requirement, result_at, bounds=(low, high), is_integer=control["kind"] == "integer"

@@ -12,7 +12,7 @@ import pytest
 
 import foveasim as fs
 from foveasim.compare import quality_by_eccentricity
-from foveasim.compare.measure import COMPARED, best_cameras
+from foveasim.compare.metrics import COMPARED, best_cameras
 from foveasim.errors import FileError, ParameterError
 from foveasim.metrics import metric_info
 from foveasim.reconstruct import Picture

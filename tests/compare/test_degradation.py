@@ -1,4 +1,4 @@
-"""A sensor whose sites saturate, or are dead, never has a better result in any measure."""
+"""A sensor whose sites saturate, or are dead, never has a better result in any metric."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import foveasim as fs
-from foveasim.compare.measure import COMPARED
+from foveasim.compare.metrics import COMPARED
 from foveasim.config import RegionResult, Requirement, Shot
 from foveasim.metrics import METRICS, metric_info
 
@@ -53,7 +53,7 @@ def qualities(dead_fraction, exposure_s):
         info = metric_info(name)
         if info.has_scene and info.is_number and info.better is not None:
             options = {"frequency_per_mm": 50.0} if name == "mtf" else {}
-            value = fs.explore.measure(RegionResult(measure=name, **options), shot, capture)
+            value = fs.explore.result_of(RegionResult(measure=name, **options), shot, capture)
             found[f"result {name}"] = -value if info.better == "low" else value
     found["snr_by_class"] = float(fs.metrics.snr_by_class(camera, scene(), exposure_s=exposure_s).snr[0])
     return found, capture.saturated_fraction

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import foveasim as fs
-from foveasim.compare.measure import ComparedShot, best_cameras
+from foveasim.compare.metrics import ComparedShot, best_cameras
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.metrics import METRICS, MetricInfo, metric_info
 from foveasim.metrics.registry import number_of

@@ -55,25 +55,25 @@ def test_results_of_regions_have_closed_forms(taken):
     radius_um = np.hypot(*seen.layout.centroid_um.T)
     inner, outer = radius_um < 40.0, radius_um >= 60.0
     for chosen, annulus_um in ((inner, (0.0, 40.0)), (outer, (60.0, 200.0))):
-        ratio = explore.measure(of("snr", annulus_um=annulus_um), quiet, seen)
+        ratio = explore.result_of(of("snr", annulus_um=annulus_um), quiet, seen)
         step_e = 30.0 * 1e-12 / 1.602176634e-19 / 2**16
         expected = seen.expected_e / np.sqrt(seen.expected_e + step_e**2 / 12.0)
         assert ratio == pytest.approx(np.median(expected[chosen]), rel=1e-3)
-        assert explore.measure(of("snr_db", annulus_um=annulus_um), quiet, seen) == pytest.approx(
+        assert explore.result_of(of("snr_db", annulus_um=annulus_um), quiet, seen) == pytest.approx(
             20 * math.log10(ratio)
         )
-        assert explore.measure(of("n_sites", annulus_um=annulus_um), quiet, seen) == chosen.sum()
+        assert explore.result_of(of("n_sites", annulus_um=annulus_um), quiet, seen) == chosen.sum()
 
     half = capture.layout.centroid_um[:, 0] > 0
     rectangle_um = (0.0, -200.0, 200.0, 200.0)
-    assert explore.measure(of("n_sites", rectangle_um=rectangle_um), shot, capture) == half.sum()
-    assert explore.measure(of("mean_code_dn", rectangle_um=rectangle_um), shot, capture) == pytest.approx(
+    assert explore.result_of(of("n_sites", rectangle_um=rectangle_um), shot, capture) == half.sum()
+    assert explore.result_of(of("mean_code_dn", rectangle_um=rectangle_um), shot, capture) == pytest.approx(
         capture.code[half].mean()
     )
-    assert explore.measure(of("mean_code_dn", site=5), shot, capture) == capture.code[5]
-    assert explore.measure(of("smallest_size_um"), shot, capture) == pytest.approx(capture.layout.size_um.min())
-    assert explore.measure(of("violations"), shot, capture) == (capture.layout.size_um < 5.0 - 1e-9).sum()
-    assert explore.measure(of("exposure_s"), shot, capture) == 0.002
+    assert explore.result_of(of("mean_code_dn", site=5), shot, capture) == capture.code[5]
+    assert explore.result_of(of("smallest_size_um"), shot, capture) == pytest.approx(capture.layout.size_um.min())
+    assert explore.result_of(of("violations"), shot, capture) == (capture.layout.size_um < 5.0 - 1e-9).sum()
+    assert explore.result_of(of("exposure_s"), shot, capture) == 0.002
 
 
 def test_mtf_is_that_of_lens_and_square():
@@ -81,7 +81,7 @@ def test_mtf_is_that_of_lens_and_square():
         None, {**SHOT, "layout": {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 6.0}}}
     )
     capture = shot.camera.capture(shot.scene, exposure_s=0.002, seed=0)
-    found = explore.measure(of("mtf", frequency_per_mm=50.0), shot, capture)
+    found = explore.result_of(of("mtf", frequency_per_mm=50.0), shot, capture)
     cut_off = 50e-3 * 0.55 * shot.camera.optics.working_f_number(1.0)  # frequency times λN
     lens = 2.0 / math.pi * (math.acos(cut_off) - cut_off * math.sqrt(1.0 - cut_off**2))
 
@@ -91,8 +91,8 @@ def test_mtf_is_that_of_lens_and_square():
 def test_metrics_and_requirements_agree(taken):
     shot, capture = taken
     for name in ("n_sites", "saturated_fraction", "mean_code_dn", "data_rate_gbit_per_s"):
-        assert explore.measure(of(name), shot, capture) == pytest.approx(METRICS[name](shot, shot.camera, capture))
-    assert explore.measure(of("snr"), shot, capture) == METRICS["snr"](shot, shot.camera, capture)["median"]
+        assert explore.result_of(of(name), shot, capture) == pytest.approx(METRICS[name](shot, shot.camera, capture))
+    assert explore.result_of(of("snr"), shot, capture) == METRICS["snr"](shot, shot.camera, capture)["median"]
 
 
 def test_picture_quality_is_of_the_region():
@@ -107,19 +107,19 @@ def test_picture_quality_is_of_the_region():
     }
     shot = build_shot(None, {**SHOT, "scene": scene})
     capture = shot.camera.capture(shot.scene, exposure_s=0.002, seed=0)
-    whole = explore.measure(of("psnr_db"), shot, capture)
-    ring = explore.measure(of("psnr_db", annulus_um=(40.0, 80.0)), shot, capture)
-    box = explore.measure(of("psnr_db", rectangle_um=(30.0, -20.0, 70.0, 20.0)), shot, capture)
-    disc = explore.measure(of("psnr_db", annulus_um=(0.0, 60.0)), shot, capture)
-    square = explore.measure(of("psnr_db", rectangle_um=(-60.0, -60.0, 60.0, 60.0)), shot, capture)
-    corners = explore.measure(of("psnr_db", annulus_um=(60.0, 60.0 * 2.0**0.5)), shot, capture)
+    whole = explore.result_of(of("psnr_db"), shot, capture)
+    ring = explore.result_of(of("psnr_db", annulus_um=(40.0, 80.0)), shot, capture)
+    box = explore.result_of(of("psnr_db", rectangle_um=(30.0, -20.0, 70.0, 20.0)), shot, capture)
+    disc = explore.result_of(of("psnr_db", annulus_um=(0.0, 60.0)), shot, capture)
+    square = explore.result_of(of("psnr_db", rectangle_um=(-60.0, -60.0, 60.0, 60.0)), shot, capture)
+    corners = explore.result_of(of("psnr_db", annulus_um=(60.0, 60.0 * 2.0**0.5)), shot, capture)
 
     # The square is the disc and its corners; those outside the layout have no values.
     assert min(disc, corners) - 1.0 < square < max(disc, corners) + 1.0
     assert whole == pytest.approx(METRICS["psnr_db"](shot, shot.camera, capture))
     assert all(5.0 < value < 50.0 for value in (whole, ring, box))
     with pytest.raises(SimulationError, match="needs an annulus or a rectangle"):
-        explore.measure(of("psnr_db", site=0), shot, capture)
+        explore.result_of(of("psnr_db", site=0), shot, capture)
 
 
 def test_margins_are_distances_from_the_nearest_limit():
@@ -156,9 +156,9 @@ def test_wrong_requirements_are_one_line(options, message):
 
 def test_regions_without_sites_are_errors(taken):
     with pytest.raises(SimulationError, match="from 500 to 600 µm: the region contains no photosite"):
-        explore.measure(of("snr", annulus_um=(500.0, 600.0)), *taken)
+        explore.result_of(of("snr", annulus_um=(500.0, 600.0)), *taken)
     with pytest.raises(SimulationError, match="has only"):
-        explore.measure(of("snr", site=10**6), *taken)
+        explore.result_of(of("snr", site=10**6), *taken)
 
 
 # -- files, commands, sweeps --------------------------------------------------------------------------------------------------

@@ -441,7 +441,7 @@ CALLS = {
     ),
     "distortion.to_opencv": lambda o: distortion.to_opencv(o.lens, image_size=(64, 64), pixel_um=10.0),
     "explore.check_requirements": lambda o: explore.check_requirements(o.shot, o.result.capture),
-    "explore.measure": lambda o: explore.measure(LIMIT, o.shot, o.result.capture),
+    "explore.result_of": lambda o: explore.result_of(LIMIT, o.shot, o.result.capture),
     "explore.solve": lambda o: explore.solve(SHOT, "exposure_s", LIMIT, bounds=(1e-6, 1.0)),
     "explore.best_table": lambda o: explore.best_table(o.study_plan, o.study),
     "explore.classification": lambda o: explore.classification([PICTURE], VARIED, labels=["cat"])[0],

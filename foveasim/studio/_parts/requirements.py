@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from foveasim.errors import FoveasimError
-from foveasim.explore import CheckedRequirement, measure
+from foveasim.explore import CheckedRequirement, result_of
 from foveasim.metrics import METRICS, metric_info
 from foveasim.metrics.registry import has_region
 from foveasim.studio._engine import Simulated
@@ -19,7 +19,7 @@ def requirements(result: Simulated) -> PartData:
     for requirement in result.shot.requirements:
         row: dict[str, Any] = {"subject": requirement.subject, "text": str(requirement), "unit": requirement.unit}
         try:
-            checked = CheckedRequirement(requirement, measure(requirement, result.shot, result.capture))
+            checked = CheckedRequirement(requirement, result_of(requirement, result.shot, result.capture))
         except FoveasimError as error:
             row |= {"value": None, "margin": None, "is_met": False, "problem": str(error)}
         else:

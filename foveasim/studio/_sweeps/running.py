@@ -12,7 +12,7 @@ from typing import Any
 
 from foveasim.config import RegionResult
 from foveasim.errors import SimulationError
-from foveasim.explore import measure
+from foveasim.explore import result_of
 from foveasim.studio._costs import SupersededError
 from foveasim.studio._engine import Simulated
 from foveasim.studio._settings.changes import is_frame
@@ -98,7 +98,7 @@ class Sweep:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # those of the simulation are in the state
-                found = measure(result, simulated.shot, simulated.capture)
+                found = result_of(result, simulated.shot, simulated.capture)
         except Exception as error:  # noqa: BLE001 -- as above
             self._explain(line(error))
             return math.nan
