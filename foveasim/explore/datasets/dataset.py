@@ -6,7 +6,6 @@ import hashlib
 import json
 import operator
 import warnings
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,6 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.caches import BoundedCache
 from foveasim._core.calls import Limits, OwnCheck
 from foveasim._core.provenance import versions
 from foveasim._core.random_streams import Streams
@@ -215,7 +215,7 @@ class Dataset:
 
     def _reset(self) -> None:
         """Initialise the state of a process: caches and warnings."""
-        self._cache: dict[str, OrderedDict[str, tuple[Any, list[Warning]]]] = {}
+        self._cache: dict[str, BoundedCache] = {}
         self._messages: list[Warning] = []
         self._has_warned = False
 
@@ -401,16 +401,14 @@ class Dataset:
 
         The warnings of its construction are stored with it, so that every sample that uses it reports them.
         """
-        parts = self._cache.setdefault(part, OrderedDict())
-        key = json.dumps(settings, sort_keys=True)
-        if key not in parts:
+
+        def compute() -> tuple[Any, list[Warning]]:
             with _record_warnings() as caught:
-                value = make()
-            parts[key] = value, [_as_warning(each.message) for each in caught]
-            if len(parts) > MAX_CACHED:
-                parts.popitem(last=False)
-        parts.move_to_end(key)
-        value, messages = parts[key]
+                made = make()
+            return made, [_as_warning(each.message) for each in caught]
+
+        parts = self._cache.setdefault(part, BoundedCache(MAX_CACHED))
+        value, messages = parts.get(json.dumps(settings, sort_keys=True), compute)
         self._messages += messages
         return value
 
