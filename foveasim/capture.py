@@ -16,9 +16,9 @@ from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.rings import same_rings
-from foveasim._core.show import Drawn, drawn
+from foveasim._core.show import ViewMethod, view_method
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import Floats, Ints, check_count, own, read_only, unit_of, unmasked
+from foveasim._core.validation import Floats, Ints, check_count, frozen_array, read_only, unit_of, unmasked
 from foveasim._io.atomic import atomic_directory
 from foveasim._io.npz import open_archive, write_archive
 from foveasim._io.zarr_stores import ZARR, Variable, free_name, open_store, store_format, write_variables
@@ -143,7 +143,7 @@ class Capture:
                 raise ParameterError(name, "must be finite and >= 0 everywhere")
             if limit is not None and largest > limit:
                 raise ParameterError(name, f"must be <= {limit} everywhere", int(largest))
-            object.__setattr__(self, name, own(values))
+            object.__setattr__(self, name, frozen_array(values))
         # Captures of one camera share settings; a copy lets users edit those of one.
         object.__setattr__(self, "settings", copy_plain_data(self.settings))
         object.__setattr__(self, "stage_s", dict(self.stage_s))
@@ -491,10 +491,10 @@ class Capture:
                 )
         return known
 
-    to_pyvista: ClassVar[Drawn[PolyData]] = drawn("polydata")
-    plot: ClassVar[Drawn[Axes]] = drawn("plot_capture")
-    plot3d: ClassVar[Drawn[None]] = drawn("show_columns")
-    _repr_html_ = drawn("to_html")
+    to_pyvista: ClassVar[ViewMethod[PolyData]] = view_method("polydata")
+    plot: ClassVar[ViewMethod[Axes]] = view_method("plot_capture")
+    plot3d: ClassVar[ViewMethod[None]] = view_method("show_columns")
+    _repr_html_ = view_method("to_html")
 
     def to_xarray(self) -> xr.Dataset:
         """

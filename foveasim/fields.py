@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import publish
 from foveasim._core.rings import check_packed, select_sites
 from foveasim._core.short_repr import short_repr
-from foveasim._core.show import Drawn, drawn
+from foveasim._core.show import ViewMethod, view_method
 from foveasim._core.validation import (
     Floats,
     Images,
@@ -27,7 +27,7 @@ from foveasim._core.validation import (
     check_pitch_um,
     check_point,
     check_shape,
-    own,
+    frozen_array,
     read_only,
     unmasked,
     wavelengths_nm,
@@ -103,7 +103,7 @@ class Outlines:
     def __post_init__(self) -> None:
         rings = check_packed(self.xy_um, self.ring_offsets, self.site_offsets, min_vertices=0, min_rings=0)
         for name, array in zip(("xy_um", "ring_offsets", "site_offsets"), rings, strict=True):
-            object.__setattr__(self, name, own(array))
+            object.__setattr__(self, name, frozen_array(array))
 
     @property
     def n_sites(self) -> int:
@@ -330,7 +330,7 @@ class PowerMap:
                 f"must have the shape (n_band, n_y, n_x) = {(wavelength_nm.size, *self.grid.shape)} of the "
                 f"wavelengths and the grid, got {data.shape}",
             )
-        object.__setattr__(self, "data", own(data))
+        object.__setattr__(self, "data", frozen_array(data))
         object.__setattr__(self, "wavelength_nm", wavelength_nm)
 
     def __repr__(self) -> str:
@@ -339,8 +339,8 @@ class PowerMap:
         bands = f"1 band at {low_nm:g} nm" if n_bands == 1 else f"{n_bands} bands from {low_nm:g} to {high_nm:g} nm"
         return f"PowerMap({n_x} x {n_y} cells of {self.grid.pitch_x_um:.4g} x {self.grid.pitch_y_um:.4g} µm, {bands})"
 
-    plot: ClassVar[Drawn[Axes]] = drawn("plot_power_map")
-    _repr_html_ = drawn("to_html")
+    plot: ClassVar[ViewMethod[Axes]] = view_method("plot_power_map")
+    _repr_html_ = view_method("to_html")
 
     @classmethod
     def from_array(

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.calls import Limits, OwnCheck, check_declared, publish
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Bools, Floats, Ints, as_numbers, finite_array, own, read_only
+from foveasim._core.validation import Bools, Floats, Ints, as_numbers, finite_array, frozen_array, read_only
 from foveasim.errors import ParameterError
 
 __all__ = ["ChiefRayTable", "Incidence"]
@@ -196,7 +196,7 @@ class Incidence:
         # Only called for attributes that are not set: the positions in rows and columns.
         if name != "field_um" or self.axes_um is None:
             raise AttributeError(f"'Incidence' object has no attribute '{name}'")
-        object.__setattr__(self, name, own(self.positions_um(np.arange(self.n_sites))))
+        object.__setattr__(self, name, frozen_array(self.positions_um(np.arange(self.n_sites))))
         return self.field_um
 
     def __post_init__(self) -> None:
@@ -206,7 +206,7 @@ class Incidence:
             raise ParameterError("field_um", f"must have the shape (n_site, 2), got {field_um.shape}")
         if not math.isfinite(field_um.sum()):
             finite_array("field_um", field_um)  # raises an error with the position
-        object.__setattr__(self, "field_um", own(field_um))
+        object.__setattr__(self, "field_um", frozen_array(field_um))
         if not self.exit_pupil_um > 0.0:
             raise ParameterError("exit_pupil_um", "must be > 0", self.exit_pupil_um, "µm")
 

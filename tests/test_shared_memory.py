@@ -10,7 +10,7 @@ import pytest
 
 import foveasim as fs
 from foveasim import distortion, modes, optics, video, view
-from foveasim._core.validation import freeze, own, read_only
+from foveasim._core.validation import freeze, frozen_array, read_only
 from foveasim.maps import from_xarray, read_power_map, to_xarray, write_power_map
 from foveasim.metrics.photon_transfer import PhotonTransfer
 from foveasim.reconstruct import Picture
@@ -304,19 +304,19 @@ def test_read_only_arrays_are_shared():
     assert peak < 0.1 * data.nbytes
 
 
-def test_own_copies_unless_owners_are_read_only(tmp_path):
+def test_frozen_arrays_are_copies_of_writeable_ones(tmp_path):
     data = np.arange(6.0)
     view_of_data = read_only(data[::2])
 
-    assert not np.shares_memory(own(view_of_data), data)
-    assert own(view_of_data).tolist() == [0.0, 2.0, 4.0]
+    assert not np.shares_memory(frozen_array(view_of_data), data)
+    assert frozen_array(view_of_data).tolist() == [0.0, 2.0, 4.0]
     buffer = np.frombuffer(bytearray(16))
-    assert not np.shares_memory(own(read_only(buffer)), buffer)
+    assert not np.shares_memory(frozen_array(read_only(buffer)), buffer)
     np.save(tmp_path / "map.npy", data)
-    assert isinstance(own(np.load(tmp_path / "map.npy", mmap_mode="r")), np.memmap)
-    assert not isinstance(own(np.load(tmp_path / "map.npy", mmap_mode="r+")).base, np.memmap)
+    assert isinstance(frozen_array(np.load(tmp_path / "map.npy", mmap_mode="r")), np.memmap)
+    assert not isinstance(frozen_array(np.load(tmp_path / "map.npy", mmap_mode="r+")).base, np.memmap)
     window = freeze(data[2:])
-    assert own(window) is window
+    assert frozen_array(window) is window
     with pytest.raises(ValueError, match="read-only"):
         data[0] = 1.0
 

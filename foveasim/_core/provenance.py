@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.validation import own
+from foveasim._core.validation import frozen_array
 from foveasim._version import __version__
 
 #: Arrays up to this size are stored as lists; larger arrays as shape, dtype and checksum.
@@ -102,7 +102,7 @@ def copy_plain_data(value: Any) -> Any:
         return [copy_plain_data(item) for item in value]
     if type(value) is tuple:
         return tuple(copy_plain_data(item) for item in value)
-    return own(value) if isinstance(value, np.ndarray) else value
+    return frozen_array(value) if isinstance(value, np.ndarray) else value
 
 
 def differences(one: Any, other: Any, prefix: str = "") -> Iterator[str]:

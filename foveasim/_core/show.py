@@ -29,7 +29,7 @@ class _OfFunction:
         self.of_function: Callable[[Callable[..., Any]], Any] = of_function
         self.of_class: Any = of_class
 
-    def __get__(self, method: Drawn[Any] | None, owner: type | None = None) -> Any:
+    def __get__(self, method: ViewMethod[Any] | None, owner: type | None = None) -> Any:
         return self.of_class if method is None else self.of_function(method.function)
 
 
@@ -42,10 +42,10 @@ def _signature(function: Callable[..., Any]) -> inspect.Signature:
     )
 
 
-class Drawn(Generic[R]):
+class ViewMethod(Generic[R]):
     __doc__ = _OfFunction(
         lambda function: Docstring.of(function).without_first_parameter(),
-        "Method that is a function of :mod:`foveasim.view`; created by :func:`drawn`.",
+        "Method that is a function of :mod:`foveasim.view`; created by :func:`view_method`.",
     )
     __signature__: Any = _OfFunction(
         _signature, inspect.Signature([inspect.Parameter("name", inspect.Parameter.POSITIONAL_OR_KEYWORD)])
@@ -81,15 +81,15 @@ class Drawn(Generic[R]):
 
 
 @overload
-def drawn(name: Literal["to_html"]) -> Drawn[str]: ...
+def view_method(name: Literal["to_html"]) -> ViewMethod[str]: ...
 @overload
-def drawn(name: Literal["to_png"]) -> Drawn[bytes | None]: ...
+def view_method(name: Literal["to_png"]) -> ViewMethod[bytes | None]: ...
 @overload
-def drawn(name: Literal["polydata"]) -> Drawn[PolyData]: ...
+def view_method(name: Literal["polydata"]) -> ViewMethod[PolyData]: ...
 @overload
-def drawn(name: Literal["show_columns"]) -> Drawn[None]: ...
+def view_method(name: Literal["show_columns"]) -> ViewMethod[None]: ...
 @overload
-def drawn(
+def view_method(
     name: Literal[
         "plot_capture",
         "plot_cortical",
@@ -100,8 +100,8 @@ def drawn(
         "plot_report",
         "plot_scene",
     ],
-) -> Drawn[Axes]: ...
-def drawn(name: str) -> Drawn[Any]:
+) -> ViewMethod[Axes]: ...
+def view_method(name: str) -> ViewMethod[Any]:
     """
     Return a method that calls a function of :mod:`foveasim.view` with its object.
 
@@ -113,9 +113,9 @@ def drawn(name: str) -> Drawn[Any]:
     Examples
     --------
     >>> class Spot:
-    ...     plot = drawn("plot_layout")
+    ...     plot = view_method("plot_layout")
     >>> import inspect
     >>> list(inspect.signature(Spot().plot).parameters)[:2]
     ['by', 'label']
     """
-    return Drawn(name)
+    return ViewMethod(name)

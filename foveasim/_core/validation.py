@@ -444,7 +444,7 @@ def own_arrays(instance: Any) -> None:
     for field in fields(instance):
         values = unmasked(field.name, getattr(instance, field.name))
         if isinstance(values, np.ndarray | list | tuple):
-            object.__setattr__(instance, field.name, own(np.asarray(values)))
+            object.__setattr__(instance, field.name, frozen_array(np.asarray(values)))
 
 
 def read_only(array: _Array) -> _Array:
@@ -466,7 +466,7 @@ def freeze(array: _Array) -> _Array:
     return array
 
 
-def own(array: _Array) -> _Array:
+def frozen_array(array: _Array) -> _Array:
     """
     Return the values as a read-only array, independent of the caller's array.
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from foveasim._core.calls import NOT_NEGATIVE, Limits, OwnCheck
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.random_streams import Streams
-from foveasim._core.show import drawn
+from foveasim._core.show import view_method
 from foveasim._core.threads import cached_property, thread_count
 from foveasim._core.validation import Floats, check_per_site, check_point, finite_array
 from foveasim.camera._clock import Clock
@@ -149,7 +149,7 @@ class Camera:
     def __repr__(self) -> str:
         return f"Camera({self._optics!r}, {self._sensor!r})"
 
-    _repr_html_ = drawn("to_html")
+    _repr_html_ = view_method("to_html")
 
     @property
     def optics(self) -> Optics:

@@ -123,18 +123,18 @@ class Integrator:
         self._outlines = outlines
         self._n_sites: int = layout.n_sites if hasattr(layout, "n_sites") else layout.site_offsets.size - 1
         self._gain: Floats | None = None
-        self._passes: Plan | TracedOutlines | RectanglePlan | LatticePlan
+        self._overlaps: Plan | TracedOutlines | RectanglePlan | LatticePlan
         rectangles = rectangle_plan(layout, grid, self.order) if distortion is None else None
         if rectangles is not None:
-            self._passes = rectangles
+            self._overlaps = rectangles
             return
         if compiled:
-            self._passes, area_um2 = self._compile()
+            self._overlaps, area_um2 = self._compile()
         else:
-            self._passes = TracedOutlines(outlines, self._n_sites, grid, self.order, self.n_threads)
-            area_um2 = self._passes.area_um2
+            self._overlaps = TracedOutlines(outlines, self._n_sites, grid, self.order, self.n_threads)
+            area_um2 = self._overlaps.area_um2
             _require_counter_clockwise(area_um2)
-        is_outside = self._passes.coverage.is_outside
+        is_outside = self._overlaps.coverage.is_outside
         if distortion is not None and (conserve == "density" or is_outside.any()):
             self._gain = np.where(is_outside, 0.0, 1.0)
             if conserve == "density":
@@ -147,14 +147,14 @@ class Integrator:
         return plan, area_um2
 
     @cached_property
-    def _plan(self) -> Plan:
+    def _compiled(self) -> Plan:
         """Spans of all outlines; rectangles need them for matrices and adjoints only."""
-        return self._passes if isinstance(self._passes, Plan) else self._compile()[0]
+        return self._overlaps if isinstance(self._overlaps, Plan) else self._compile()[0]
 
     @property
     def sites_outside_image_circle(self) -> Ints:
         """Indices of sites outside the image circle of the lens, which receive no power."""
-        return np.flatnonzero(self._passes.coverage.is_outside)
+        return np.flatnonzero(self._overlaps.coverage.is_outside)
 
     def __repr__(self) -> str:
         return f"Integrator({self.n_sites} sites on {self.grid})"
@@ -162,7 +162,7 @@ class Integrator:
     @property
     def is_compiled(self) -> bool:
         """Whether calls use stored overlaps, or are as fast without."""
-        return not isinstance(self._passes, TracedOutlines)
+        return not isinstance(self._overlaps, TracedOutlines)
 
     @property
     def n_sites(self) -> int:
@@ -176,7 +176,7 @@ class Integrator:
 
         Sites outside the image circle do not count; NaN without others.
         """
-        return self._passes.coverage.bounds_um
+        return self._overlaps.coverage.bounds_um
 
     @property
     def uncovered_um2(self) -> Floats:
@@ -185,12 +185,12 @@ class Integrator:
 
         Areas are measured in the plane of the map.
         """
-        return self._passes.coverage.uncovered_um2
+        return self._overlaps.coverage.uncovered_um2
 
     @cached_property
     def n_uncovered(self) -> int:
         """Number of sites that extend beyond the grid or the image circle."""
-        return self._passes.coverage.n_uncovered
+        return self._overlaps.coverage.n_uncovered
 
     def __call__(self, power_map: ArrayLike, *, where: ArrayLike | None = None, out: Floats | None = None) -> Floats:
         """
@@ -253,7 +253,7 @@ class Integrator:
             raise ParameterError("out", f"must be a C-contiguous float64 array of shape {shape}", out)
         for band in np.ndindex(*cells.shape[:-2]):
             cell_means = np.ascontiguousarray(cells[band])
-            self._passes.gather(cell_means, power[band], self.grid.cell_area_um2, mask, self.n_threads)
+            self._overlaps.gather(cell_means, power[band], self.grid.cell_area_um2, mask, self.n_threads)
         if self._gain is not None:
             np.multiply(power, self._gain, out=power, where=mask if mask.size else True)
         return power
@@ -278,7 +278,7 @@ class Integrator:
             values = values * self._gain
         cells = np.empty((*values.shape[:-1], *self.grid.shape))
         for band in np.ndindex(*values.shape[:-1]):
-            cells[band] = self._plan.scatter(values[band], self.n_threads)
+            cells[band] = self._compiled.scatter(values[band], self.n_threads)
         cells *= self.grid.cell_area_um2
         return cells
 
@@ -291,7 +291,7 @@ class Integrator:
         weights : csr_array (n_site, n_y * n_x) float64, µm²
             ``area(site ∩ cell)``; ``weights @ power_map.ravel()`` is ``integrator(power_map)``.
         """
-        matrix = self._plan.matrix() * self.grid.cell_area_um2
+        matrix = self._compiled.matrix() * self.grid.cell_area_um2
         if self._gain is not None:
             matrix = matrix.multiply(self._gain[:, np.newaxis]).tocsr()
         return matrix

@@ -27,7 +27,7 @@ from foveasim._core.rings import (
     site_bounds_um,
     site_moments,
 )
-from foveasim._core.show import Drawn, drawn, load
+from foveasim._core.show import ViewMethod, load, view_method
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import (
     MAX_LENGTH_UM,
@@ -40,7 +40,7 @@ from foveasim._core.validation import (
     exact_integers,
     finite_array,
     freeze,
-    own,
+    frozen_array,
     read_only,
     unmasked,
 )
@@ -167,7 +167,7 @@ class Layout:
                 finite_array("xy_um", xy_um)  # raises an error with the position
             _require_near_origin(largest_um)
         for name, array in zip(RINGS, rings, strict=True):
-            object.__setattr__(self, name, own(array))
+            object.__setattr__(self, name, frozen_array(array))
         self._store_columns()
 
     def _store_columns(self) -> None:
@@ -565,10 +565,10 @@ class Layout:
         describe = load("layout.summary").describe
         return describe(self, readout)
 
-    to_pyvista: ClassVar[Drawn[PolyData]] = drawn("polydata")
-    plot: ClassVar[Drawn[Axes]] = drawn("plot_layout")
-    plot3d: ClassVar[Drawn[None]] = drawn("show_columns")
-    _repr_html_ = drawn("to_html")
+    to_pyvista: ClassVar[ViewMethod[PolyData]] = view_method("polydata")
+    plot: ClassVar[ViewMethod[Axes]] = view_method("plot_layout")
+    plot3d: ClassVar[ViewMethod[None]] = view_method("show_columns")
+    _repr_html_ = view_method("to_html")
 
     # -- neighbours ----------------------------------------------------------------------------------------------
 
@@ -653,7 +653,7 @@ def _column(name: str, values: ArrayLike) -> NDArray[Any]:
     """Convert a data column to a read-only array of numbers or strings."""
     values = unmasked(name, values)
     try:
-        column = own(np.asarray(values))
+        column = frozen_array(np.asarray(values))
     except ValueError:
         raise ParameterError(name, "must have one value for each site", values) from None
     is_as_given = isinstance(values, np.ndarray) and values.dtype.kind == "f"

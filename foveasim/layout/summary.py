@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from foveasim._core.quantities import format_quantity
-from foveasim._core.show import drawn
+from foveasim._core.show import view_method
 from foveasim._core.validation import Floats, Ints
 from foveasim.layout.drc.routing import Readout
 from foveasim.layout.model import Layout
@@ -119,7 +119,7 @@ class Summary:
     def __str__(self) -> str:
         return "\n".join(f"{name}: {value}" for name, value in self.rows())
 
-    _repr_html_ = drawn("to_html")
+    _repr_html_ = view_method("to_html")
 
     def __rich__(self) -> RenderableType:
         from rich.console import Group

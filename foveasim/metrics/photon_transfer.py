@@ -25,7 +25,7 @@ from foveasim._core.validation import (
     check_count,
     check_per_site,
     finite_array,
-    own,
+    frozen_array,
     read_only,
     unmasked,
 )
@@ -90,9 +90,9 @@ class PhotonTransfer:
             values = finite_array(name, getattr(self, name))
             if values.shape != shape:
                 raise ParameterError(name, f"must have shape (n_level, n_class) = {shape}, got {values.shape}")
-            object.__setattr__(self, name, own(values))
+            object.__setattr__(self, name, frozen_array(values))
         for name in ("classes", "n_sites", "n_frames"):
-            object.__setattr__(self, name, own(np.asarray(unmasked(name, getattr(self, name)))))
+            object.__setattr__(self, name, frozen_array(np.asarray(unmasked(name, getattr(self, name)))))
 
     def __repr__(self) -> str:
         return f"PhotonTransfer({self.n_frames.size} levels, {self.classes.size} classes of {self.n_sites.sum()} sites)"

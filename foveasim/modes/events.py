@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import FINITE, POSITIVE, OwnCheck
 from foveasim._core.extras import import_optional
 from foveasim._core.provenance import to_plain_data
-from foveasim._core.validation import Floats, Ints, as_numbers, finite_array, own, read_only
+from foveasim._core.validation import Floats, Ints, as_numbers, finite_array, frozen_array, read_only
 from foveasim._io.atomic import atomic_write, check_free_space
 from foveasim._io.formats import as_file_error
 from foveasim._io.npz import open_archive, write_archive
@@ -98,7 +98,7 @@ class Events:
                 bad = polarity[np.abs(polarity) != 1]
                 raise ParameterError("polarity", "must be 1 or -1", int(bad[0]), hint="convert 0 and 1 with 2 * p - 1")
         for name, values, dtype in zip(ARRAYS, (t_s, site, polarity), (np.float64, np.int32, np.int8), strict=True):
-            object.__setattr__(self, name, own(values.astype(dtype, copy=False)))
+            object.__setattr__(self, name, frozen_array(values.astype(dtype, copy=False)))
 
     def __repr__(self) -> str:
         return f"Events({self.t_s.size:,} of {self.layout.n_sites:,} sites)"

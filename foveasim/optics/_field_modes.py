@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import parallel_map
-from foveasim._core.validation import Floats, as_numbers, own
+from foveasim._core.validation import Floats, as_numbers, frozen_array
 from foveasim.fields import Grid
 from foveasim.optics._aperture import PSFModel, overlaps
 
@@ -99,7 +99,7 @@ class FieldModes:
 
     def __post_init__(self) -> None:
         for name in ("points_um", "combinations", "at_points", "singular_values"):
-            object.__setattr__(self, name, own(as_numbers(name, getattr(self, name))))  # the cache of the lens has them
+            object.__setattr__(self, name, frozen_array(as_numbers(name, getattr(self, name))))
 
     @property
     def n_modes(self) -> int:

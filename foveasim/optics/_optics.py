@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import Limits, OwnCheck, Usual, check_declared
 from foveasim._core.short_repr import short_repr
-from foveasim._core.show import drawn
+from foveasim._core.show import view_method
 from foveasim._core.threads import thread_count
 from foveasim._core.validation import Bools, Floats, check_number, check_point, finite_array, read_only, wavelengths_nm
 from foveasim.errors import ParameterError, SamplingWarning, warn
@@ -235,7 +235,7 @@ class Optics(PointImages):
 
     __repr__ = short_repr
 
-    _repr_html_ = drawn("to_html")
+    _repr_html_ = view_method("to_html")
 
     def __post_init__(self) -> None:
         check_declared(self)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from foveasim._core.validation import Floats, as_numbers, finite_array, own
+from foveasim._core.validation import Floats, as_numbers, finite_array, frozen_array
 from foveasim.errors import ParameterError
 
 #: Patches of the colour chart.
@@ -21,7 +21,7 @@ def check_matrix(name: str, matrix: Floats, n_channels: int | None = None) -> Fl
     if found.shape[0] != 3 or n_channels not in (None, found.shape[1]):
         columns = "n_channel" if n_channels is None else n_channels
         raise ParameterError(name, f"must have the shape (3, {columns}), got {found.shape}")
-    return own(found)
+    return frozen_array(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class ColourCorrection:
             values = as_numbers(name, getattr(self, name), missing_is_nan=missing_is_nan)
             if values.shape != (N_PATCHES,) or not (np.isfinite(values) | missing_is_nan).all():
                 raise ParameterError(name, f"must be {N_PATCHES} finite values, one for each patch", values)
-            object.__setattr__(self, name, own(values))
+            object.__setattr__(self, name, frozen_array(values))
 
     def __repr__(self) -> str:
         raw = "" if np.isnan(self.delta_e_raw).any() else f"; raw: mean {self.delta_e_raw.mean():.3g}"

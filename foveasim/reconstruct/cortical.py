@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FINITE, NOT_NEGATIVE, POSITIVE, Limits
 from foveasim._core.short_repr import short_repr
-from foveasim._core.show import Drawn, drawn
+from foveasim._core.show import ViewMethod, view_method
 from foveasim._core.validation import (
     Floats,
     Images,
@@ -29,7 +29,7 @@ from foveasim._core.validation import (
     check_count,
     check_point,
     finite_array,
-    own,
+    frozen_array,
     read_only,
 )
 from foveasim.errors import ParameterError
@@ -108,10 +108,10 @@ class CorticalImage:
         if self.sites is not None and np.shape(self.sites) != data.shape[1:]:
             raise ParameterError("sites", f"must have the shape {data.shape[1:]}", list(np.shape(self.sites)))
         for name, values in (("data", data), ("radius_um", radius_um), ("start_rad", start_rad)):
-            object.__setattr__(self, name, own(values))
+            object.__setattr__(self, name, frozen_array(values))
 
-    plot: ClassVar[Drawn[Axes]] = drawn("plot_cortical")
-    _repr_html_ = drawn("to_html")
+    plot: ClassVar[ViewMethod[Axes]] = view_method("plot_cortical")
+    _repr_html_ = view_method("to_html")
 
     @property
     def ring_centre_um(self) -> Floats:

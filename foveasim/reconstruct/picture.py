@@ -13,8 +13,18 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from foveasim._core.calls import Limits
-from foveasim._core.show import Drawn, drawn
-from foveasim._core.validation import Bools, Floats, Images, Ints, check_count, finite_array, own, read_only, unmasked
+from foveasim._core.show import ViewMethod, view_method
+from foveasim._core.validation import (
+    Bools,
+    Floats,
+    Images,
+    Ints,
+    check_count,
+    finite_array,
+    frozen_array,
+    read_only,
+    unmasked,
+)
 from foveasim._io.images import picture_format, write_picture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, Lattice, PackedRings, to_file_rows
@@ -94,7 +104,7 @@ class Picture:
     def __post_init__(self) -> None:
         for name, missing_is_nan in (("data", True), ("coverage", False)):
             values = unmasked(name, getattr(self, name), missing_is_nan=missing_is_nan)
-            object.__setattr__(self, name, own(np.asarray(values)))
+            object.__setattr__(self, name, frozen_array(np.asarray(values)))
         if self.data.ndim != 3 or self.coverage.shape != self.data.shape[1:]:
             raise ParameterError(
                 "data",
@@ -107,7 +117,7 @@ class Picture:
                 raise ParameterError(
                     "white", f"must be one number for each of the {self.data.shape[0]} channels", white
                 )
-            object.__setattr__(self, "white", own(white))
+            object.__setattr__(self, "white", frozen_array(white))
         if self.colour_matrix is not None:
             matrix = check_matrix("colour_matrix", self.colour_matrix, self.data.shape[0])
             object.__setattr__(self, "colour_matrix", matrix)
@@ -127,9 +137,9 @@ class Picture:
             image = image[..., [0, 0, 0, 1]]
         return image if dtype is None else image.astype(dtype)
 
-    plot: ClassVar[Drawn[Axes]] = drawn("plot_picture")
-    _repr_html_ = drawn("to_html")
-    _repr_png_ = drawn("to_png")
+    plot: ClassVar[ViewMethod[Axes]] = view_method("plot_picture")
+    _repr_html_ = view_method("to_html")
+    _repr_png_ = view_method("to_png")
 
     def to_rgb(self, white: float | Floats | None = None, *, clip: bool = False) -> Picture:
         """

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import Limits, OwnCheck, check_declared
-from foveasim._core.show import Drawn, drawn
+from foveasim._core.show import ViewMethod, view_method
 from foveasim._core.validation import (
     MAX_WAVELENGTH_NM,
     Floats,
@@ -26,7 +26,7 @@ from foveasim._core.validation import (
     check_shape,
     finite_array,
     freeze,
-    own,
+    frozen_array,
     read_only,
     unmasked,
     wavelengths_nm,
@@ -208,7 +208,7 @@ class Scene:
                 "spectrum_w_m2_sr_nm",
                 f"must have the shape (n_basis, n_wavelength) = {(basis.shape[0], wavelength_nm.size)}, got {spectrum.shape}",
             )
-        object.__setattr__(self, "basis", own(basis))
+        object.__setattr__(self, "basis", frozen_array(basis))
         object.__setattr__(self, "spectrum_w_m2_sr_nm", read_only(spectrum.copy()))
         object.__setattr__(self, "wavelength_nm", wavelength_nm)
         object.__setattr__(self, "band_width_nm", read_only(width_nm.copy()))
@@ -218,7 +218,7 @@ class Scene:
                 raise ParameterError(
                     "illuminant", f"must be {wavelength_nm.size} values, one per wavelength, and not all 0", illuminant
                 )
-            object.__setattr__(self, "illuminant", own(illuminant))
+            object.__setattr__(self, "illuminant", frozen_array(illuminant))
         if self.is_rgb and basis.shape[0] != len(RGB_NM):
             raise ParameterError("is_rgb", f"requires three basis images, got {basis.shape[0]}")
         object.__setattr__(self, "pitch_um", self._checked_pitch_um())
@@ -322,8 +322,8 @@ class Scene:
             f"{self.wavelength_nm.size} wavelengths, from {printable(self.source)[:MAX_SOURCE]})"
         )
 
-    plot: ClassVar[Drawn[Axes]] = drawn("plot_scene")
-    _repr_html_ = drawn("to_html")
+    plot: ClassVar[ViewMethod[Axes]] = view_method("plot_scene")
+    _repr_html_ = view_method("to_html")
 
     @classmethod
     def from_picture(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 
-from foveasim._core.show import Drawn, drawn
+from foveasim._core.show import ViewMethod, view_method
 from foveasim._core.validation import Floats, check_per_site, finite_array
 from foveasim.sensor.effects import STANDARD
 from foveasim.sensor.limits import EXPOSURE
@@ -83,8 +83,8 @@ class NoiseBudget(dict[str, Floats]):
             for name, is_temporal, values in (*parts, *sums)
         ]
 
-    plot: ClassVar[Drawn[Axes]] = drawn("plot_noise_budget")
-    _repr_html_ = drawn("to_html")
+    plot: ClassVar[ViewMethod[Axes]] = view_method("plot_noise_budget")
+    _repr_html_ = view_method("to_html")
 
 
 def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: Annotated[float, EXPOSURE]) -> NoiseBudget:

@@ -14,7 +14,7 @@ from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Limits, OwnCheck, Usual
 from foveasim._core.names import CHANNEL_LETTERS, find_wrong_letter, possible_names
 from foveasim._core.provenance import large_arrays
 from foveasim._core.random_streams import Streams
-from foveasim._core.show import drawn
+from foveasim._core.show import view_method
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import (
     Bools,
@@ -373,7 +373,7 @@ class Sensor:
     def __repr__(self) -> str:
         return f"Sensor({self.layout!r}, filters {', '.join(self.filter_names)}, {self.bits} bits)"
 
-    _repr_html_ = drawn("to_html")
+    _repr_html_ = view_method("to_html")
 
     # -- filters and quantum efficiency -------------------------------------------------------------------------
 

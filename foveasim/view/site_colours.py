@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, Ints, as_numbers, finite_array, own, unmasked, words_and_unit
+from foveasim._core.validation import Floats, Ints, as_numbers, finite_array, frozen_array, unmasked, words_and_unit
 from foveasim.capture import Capture
 from foveasim.columns import COLUMNS, MAIN, STORED, column_info
 from foveasim.errors import ParameterError, type_name
@@ -266,7 +266,7 @@ def _array_colours(by: ArrayLike, n_sites: int, label: str) -> SiteColours:
     """Return the colours of an array of values, or given colours."""
     by = unmasked("by", by, missing_is_nan=True)
     try:
-        array = own(np.asarray(by))
+        array = frozen_array(np.asarray(by))
     except ValueError:
         raise ParameterError("by", "must have one value for each site", by) from None
     if array.ndim == 0 or array.shape[0] != n_sites or array.shape[1:] not in ((), (3,)):

@@ -13,7 +13,7 @@ import pytest
 
 import foveasim as fs
 from foveasim import view
-from foveasim._core.show import Drawn
+from foveasim._core.show import ViewMethod
 from foveasim.layout import Report, Summary
 from foveasim.reconstruct import CorticalImage, Picture
 from foveasim.sensor import NoiseBudget
@@ -22,7 +22,7 @@ CLASSES = (
     *(fs.Camera, fs.Capture, fs.Layout, fs.Optics, fs.PowerMap, fs.Scene, fs.Sensor),
     *(CorticalImage, NoiseBudget, Picture, Report, Summary),
 )
-METHODS = [(kind, name) for kind in CLASSES for name, member in vars(kind).items() if isinstance(member, Drawn)]
+METHODS = [(kind, name) for kind in CLASSES for name, member in vars(kind).items() if isinstance(member, ViewMethod)]
 LAYOUT = fs.layout.grid(n_x=3, n_y=2, pitch_um=5.0)
 
 

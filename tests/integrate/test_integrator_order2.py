@@ -200,7 +200,7 @@ def test_tiling_conserves_power_of_map(name):
 @pytest.mark.parametrize("name", FAMILIES)
 def test_tiling_moments_sum_to_zero(name):
     grid = fs.Grid((23, 31), 0.1, (-1.5, -1.1))
-    plan = fs.Integrator(tiling(name), grid, order=2)._plan
+    plan = fs.Integrator(tiling(name), grid, order=2)._compiled
     sums = np.zeros((*grid.shape, 2))
     row = np.repeat(np.arange(grid.shape[0]), np.diff(plan.row_cuts))
     np.add.at(sums, (row, plan.cuts[:, 1]), plan.moments)
@@ -212,7 +212,7 @@ def test_tiling_moments_sum_to_zero(name):
 @pytest.mark.parametrize("name", [*FAMILIES, "zoo"])
 def test_overlaps_are_bit_identical_to_first_order(name):
     layout = fs.Layout.from_polygons(list(POLYGONS.values())) if name == "zoo" else tiling(name)
-    one, two = (fs.Integrator(layout, fs.Grid((40, 40), 0.3, (-6.0, -6.0)), order=order)._plan for order in (1, 2))
+    one, two = (fs.Integrator(layout, fs.Grid((40, 40), 0.3, (-6.0, -6.0)), order=order)._compiled for order in (1, 2))
 
     assert np.array_equal(one.spans, two.spans)
     assert np.array_equal(one.weights, two.weights)
@@ -302,7 +302,7 @@ def test_covered_cells_have_no_moments():
     finger = np.array([[0, 90.2], [3.1, 90.2], [3.1, 5.7], [7.0, 5.7]])
     teeth = (finger + np.stack((x, np.zeros(1000)), axis=1)[:, np.newaxis]).reshape(-1, 2)
     comb = shapely.Polygon(np.concatenate((teeth, [[x[-1] + 7.0, 2.5], [1.3, 2.5]])))
-    plan = second(comb, fs.Grid((100, 7020), 1.0))._plan
+    plan = second(comb, fs.Grid((100, 7020), 1.0))._compiled
     row = np.repeat(np.arange(plan.grid.shape[0]), np.diff(plan.row_cuts))
     column = plan.cuts[(row > 10) & (row < 90), 1]
 

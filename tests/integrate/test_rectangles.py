@@ -74,7 +74,7 @@ def test_rectangles_match_overlaps_of_cells(kind, order, dtype):
 
     power = integrator(cells)[: lattice().n_sites]
 
-    assert isinstance(integrator._passes, KINDS[kind])
+    assert isinstance(integrator._overlaps, KINDS[kind])
     np.testing.assert_allclose(power, expected_power(lattice(), grid, cells, order), rtol=1e-13, atol=1e-13)
 
 
@@ -162,7 +162,7 @@ def test_rectangles_from_any_corner_are_recognised(first):
     layout = fs.Layout(corners, [0, 4], [0, 1])
     integrator = fs.Integrator(layout, fs.Grid((4, 4), 1.0))
 
-    assert isinstance(integrator._passes, RectanglePlan)
+    assert isinstance(integrator._overlaps, RectanglePlan)
     assert integrator(np.ones((4, 4)))[0] == 6.0
 
 
@@ -179,7 +179,7 @@ def test_rectangles_from_any_corner_are_recognised(first):
 def test_other_outlines_are_not_rectangles(ring):
     layout = fs.Layout(np.array(ring, float), [0, len(ring)], [0, 1])
 
-    assert isinstance(fs.Integrator(layout, fs.Grid((4, 4), 1.0))._passes, Plan)
+    assert isinstance(fs.Integrator(layout, fs.Grid((4, 4), 1.0))._overlaps, Plan)
 
 
 def test_clockwise_rectangles_are_rejected():

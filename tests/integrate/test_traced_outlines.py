@@ -34,7 +34,7 @@ def test_traced_outlines_equal_compiled_outlines(name, order, lens):
     traced = fs.Integrator(LAYOUTS[name], GRID, compiled=False, **options)
     where = np.arange(compiled.n_sites) % 3 > 0
 
-    assert isinstance(traced._passes, TracedOutlines)
+    assert isinstance(traced._overlaps, TracedOutlines)
     scale = compiled(CELLS).max()
     np.testing.assert_allclose(traced(CELLS), compiled(CELLS), rtol=1e-12, atol=1e-13 * scale)
     np.testing.assert_allclose(

@@ -21,7 +21,7 @@ import numpy as np
 from foveasim._core.calls import FRACTION, NOT_NEGATIVE, POSITIVE, Limits, OwnCheck, check_declared
 from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
-from foveasim._core.show import Drawn, drawn
+from foveasim._core.show import ViewMethod, view_method
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array
 from foveasim.errors import GeometryError, ParameterError, type_name
@@ -404,8 +404,8 @@ class Report:
             for violation in self.violations
         ]
 
-    plot: ClassVar[Drawn[Axes]] = drawn("plot_report")
-    _repr_html_ = drawn("to_html")
+    plot: ClassVar[ViewMethod[Axes]] = view_method("plot_report")
+    _repr_html_ = view_method("to_html")
 
     def write(self, path: str | Path) -> None:
         """

@@ -24,7 +24,7 @@ from foveasim.sensor.effects.contract import NOTHING, Sites
 from foveasim.sensor.effects.crosstalk import CrosstalkOperator
 from foveasim.sensor.model.prediction import Transfer
 from foveasim.sensor.model.records import (
-    Kind,
+    NoiseKind,
     Record,
     highest_charge_e,
     is_temporal,
@@ -126,7 +126,7 @@ class Linearisation:
         return self._arguments[-1]
 
     @property
-    def sources(self) -> dict[str, Kind]:
+    def sources(self) -> dict[str, NoiseKind]:
         """Kinds of the sources of noise by name: ``"temporal"``, ``"reset"`` or ``"fixed"``."""
         return {record.name: record.kind for record in self._records if record.deviation is not None}
 

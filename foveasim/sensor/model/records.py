@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 #: Sites per block where rows of mixing operators are multiplied: bounds the memory.
 BLOCK_ROWS = 4096
 #: Source of noise: drawn for each frame, drawn at the reset, or different between devices.
-Kind: TypeAlias = Literal["temporal", "reset", "fixed"]
+NoiseKind: TypeAlias = Literal["temporal", "reset", "fixed"]
 Branch: TypeAlias = Literal["photo", "dark", ""]
 
 
@@ -41,7 +41,7 @@ class Record(NamedTuple):
     slope: Floats | CrosstalkOperator | None = None
     deviation: Floats | None = None
     groups: Ints | None = None
-    kind: Kind = "temporal"
+    kind: NoiseKind = "temporal"
     branch: Branch = ""
     half_step: Floats | None = None
     role: Literal["conversion", "response", ""] = ""
@@ -123,7 +123,7 @@ def walk(effects: Iterable[Effect], records: list[Record], mean: Floats, sites: 
     is_known = sites.known_device is not None
     for effect in effects:
         found = effect.validate_linear(mean, sites)
-        kind: Kind = "fixed" if not effect.is_temporal else "reset" if effect.is_drawn_at_reset else "temporal"
+        kind: NoiseKind = "fixed" if not effect.is_temporal else "reset" if effect.is_drawn_at_reset else "temporal"
         half_step = effect.half_step(sites.of(effect)) if is_known and effect.is_temporal else None
         records.append(Record(effect.name, *found, kind, branch, half_step))
         mean = found.mean
