@@ -185,7 +185,7 @@ def layouts() -> None:
     from foveasim._io.yaml_files import first_comment
     from foveasim.config import bundled_layouts, read_layout_file
     from foveasim.layout import LAYOUTS
-    from foveasim.layout.families import summary_of
+    from foveasim.layout.generator_registry import summary_of
 
     table = Table(box=None)
     for heading in ("name", "photosites", "field / µm", "site size / µm", "generator"):
@@ -198,11 +198,11 @@ def layouts() -> None:
             x0, y0, x1, y1 = found.bounds_um
             sizes = format_quantity([float(found.size_um[0]), float(found.size_um[-1])], "", digits=3)
             table.add_row(name, f"{found.n_sites:,}", f"{x1 - x0:.5g} x {y1 - y0:.5g}", sizes, found.origin)
-    families = _described("generator")
+    generators = _described("generator")
     for name, generator in sorted(LAYOUTS.items()):
-        families.add_row(name, summary_of(generator))
+        generators.add_row(name, summary_of(generator))
     console.print(table)
-    for each in (descriptions, families):
+    for each in (descriptions, generators):
         console.print()
         console.print(each)
 

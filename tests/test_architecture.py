@@ -94,7 +94,7 @@ def offenders(find, paths=MODULES):
 
 
 #: Decorators that register an object.
-DECORATORS = {"chart", "layout_edit", "layout_family", "part"}
+DECORATORS = {"chart", "layout_edit", "layout_generator", "part"}
 
 
 def registers(path):

@@ -15,7 +15,17 @@ import foveasim as fs
 from foveasim.columns import COLUMNS
 from foveasim.distortion import LENSES
 from foveasim.errors import ParameterError
-from foveasim.layout import DERIVED_LAYERS, EDITS, FORMATS, LAYOUTS, RULES, FileFormat, LayoutLayer, Rule, layout_family
+from foveasim.layout import (
+    DERIVED_LAYERS,
+    EDITS,
+    FORMATS,
+    LAYOUTS,
+    RULES,
+    FileFormat,
+    LayoutLayer,
+    Rule,
+    layout_generator,
+)
 from foveasim.maps import MAP_FORMATS, Found
 from foveasim.metrics import METRICS
 from foveasim.optics import PSF_FORMATS, PUPILS, PSFGrid, PupilEdges
@@ -437,7 +447,7 @@ WRONG = [
     (LAYOUTS, overlapping, {"side_um": 2.0}, None, "has sites that overlap, by up to 0.4 µm²"),
     (LAYOUTS, varying, {"side_um": 2.0}, None, "must return the same layout for the same parameters"),
     (LAYOUTS, with_fixed_gap, {"side_um": 2.0}, None, "must have twice the coordinates for twice the lengths"),
-    (LAYOUTS, single, {"side_um": 2.0}, None, "must record its name in the provenance; decorate it with layout_family"),
+    (LAYOUTS, single, {"side_um": 2.0}, None, "must record its name in the provenance; decorate it with layout_generator"),
     (LAYOUTS, single, {}, None, r"cannot be called with its example \(missing a required argument: 'side_um'\)"),
     (LAYOUTS, lambda: 3, {}, None, "must return a Layout, got int"),
     (EDITS, unrecorded_scale, {}, None, "must record the step in the provenance"),
@@ -564,10 +574,10 @@ def test_correct_extension_passes(add, registry, item, example, expected):
 
 
 @restored(LAYOUTS)
-def test_layout_family_passes_its_example():
-    layout_family(example={"side_um": 2.0})(single)
+def test_layout_generator_passes_its_example():
+    layout_generator(example={"side_um": 2.0})(single)
 
-    check_extension("layout family", "single")
+    check_extension("layout generator", "single")
 
 
 @pytest.mark.slow

@@ -60,7 +60,7 @@ class Registry(Mapping[str, T], Generic[T]):
     Parameters
     ----------
     kind : str
-        Kind of the objects, for messages: "layout family".
+        Kind of the objects, for messages: "layout generator".
     group : str
         Group of entry points, such as "foveasim.layouts"; the name of an entry point is the name of its object. Entry points
         are loaded when the registry is first read. An entry point that fails to load is logged as a warning and skipped.

@@ -26,7 +26,6 @@ from foveasim.layout.edits.at_points import (
     split_at,
 )
 from foveasim.layout.edits.layers import draw, overlay
-from foveasim.layout.families import LAYOUTS, layout_family
 from foveasim.layout.files import (
     DERIVED_LAYERS,
     FORMATS,
@@ -38,6 +37,7 @@ from foveasim.layout.files import (
     read_layout,
     write_layout,
 )
+from foveasim.layout.generator_registry import LAYOUTS, layout_generator
 from foveasim.layout.generators.foveal_cartesian import foveal_cartesian
 from foveasim.layout.generators.fovi import fovi
 from foveasim.layout.generators.giotto import giotto, giotto_ratio
@@ -104,7 +104,7 @@ __all__ = [
     "hexagonal",
     "inset",
     "layout_edit",
-    "layout_family",
+    "layout_generator",
     "log_polar",
     "merge",
     "merge_at",
@@ -143,7 +143,7 @@ __all__ = [
     "zones",
 ]
 
-if not TYPE_CHECKING:  # families registered by other packages or at run time
+if not TYPE_CHECKING:  # generators registered by other packages or at run time
     __getattr__ = LAYOUTS.attributes_of(__name__)
 
 publish(__name__)

@@ -77,7 +77,7 @@ class SolveFor:
     at_least: int = 1
 
 
-def select_unknown(family: str, unknowns: Sequence[SolveFor], parameters: Mapping[str, Any]) -> SolveFor | None:
+def select_unknown(generator: str, unknowns: Sequence[SolveFor], parameters: Mapping[str, Any]) -> SolveFor | None:
     """Return the parameter to solve for, or None when ``n_sites`` is not given."""
     free = [unknown for unknown in unknowns if parameters[unknown.name] is None]
     if parameters.get("n_sites") is None:
@@ -90,17 +90,17 @@ def select_unknown(family: str, unknowns: Sequence[SolveFor], parameters: Mappin
             return unknown
     for unknown in free:
         needed = " and ".join(f"'{name}'" for name in unknown.needs if parameters[name] is None)
-        raise ParameterError("n_sites", f"of {family} requires {needed} to solve for '{unknown.name}'")
+        raise ParameterError("n_sites", f"of {generator} requires {needed} to solve for '{unknown.name}'")
     names = [f"'{unknown.name}'" for unknown in unknowns]
     raise ParameterError(
         "n_sites",
-        f"of {family} must be used without {' or '.join(names)}, which is then solved for",
+        f"of {generator} must be used without {' or '.join(names)}, which is then solved for",
         parameters["n_sites"],
     )
 
 
 def layout_with_n_sites(
-    family: str,
+    generator: str,
     generate: Callable[[Mapping[str, Any]], Layout],
     unknown: SolveFor,
     parameters: Mapping[str, Any],
@@ -119,7 +119,7 @@ def layout_with_n_sites(
         shown = f"{value:,}" if unknown.is_integer else f"{value:.6g}"
         raise ParameterError(
             "n_sites",
-            f"of {family} must be within {100 * SITE_TOLERANCE:g} % of a possible number",
+            f"of {generator} must be within {100 * SITE_TOLERANCE:g} % of a possible number",
             target,
             hint=f"the nearest is {layout.n_sites} with '{unknown.name}' = {shown}",
         )

@@ -19,7 +19,7 @@ from foveasim._core.validation import Floats, Ints, unit_of
 from foveasim.errors import FoveasimError, ParameterError, type_name
 from foveasim.layout import Layout
 from foveasim.layout._noding import merge_coincident_points
-from foveasim.layout.families import LAYOUTS
+from foveasim.layout.generator_registry import LAYOUTS
 from foveasim.learn._tensors import constant
 from foveasim.learn.outlines import Outlines
 
@@ -46,7 +46,7 @@ def generated(generator: str | Callable[..., Layout], parameters: Mapping[str, A
     Parameters
     ----------
     generator : str or callable
-        Name of a layout family, such as ``"log_polar"``, or a function that returns a Layout.
+        Name of a layout generator, such as ``"log_polar"``, or a function that returns a Layout.
     parameters : mapping of str to number, tensor or other value
         Arguments of the generator. Tensors have no axis or one axis; those that require gradients are float64, and the others
         may be of any type.

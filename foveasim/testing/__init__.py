@@ -7,7 +7,7 @@ example of the object, ``registry.register(name, example=..., expected=...)``:
 ================  =============================================================  =========================================
 kind              example                                                        expected
 ================  =============================================================  =========================================
-layout family     parameters of a small layout
+layout generator     parameters of a small layout
 layout edit       parameters for a grid of 4 x 4 squares of 10 µm
 design rule       limits ``satisfied`` and ``violated`` by this grid; further
                   parameters of DesignRules; a function ``layout`` of another
@@ -53,7 +53,7 @@ from foveasim.errors import ParameterError
 from foveasim.testing._effects import check_effect, check_sensor_effect
 from foveasim.testing._extension import Check, Extension
 from foveasim.testing._files import check_cube_format, check_layout_format, check_map_format, check_psf_format
-from foveasim.testing._layouts import check_derived_layer, check_edit, check_family, check_rule
+from foveasim.testing._layouts import check_derived_layer, check_edit, check_generator, check_rule
 from foveasim.testing._lenses import check_curve, check_lens, check_pupil
 from foveasim.testing._metrics import check_column, check_metric
 from foveasim.testing._pixel_optics import check_pixel_optics
@@ -67,7 +67,7 @@ MAX_QUOTED = 300
 CHECKS: dict[str, Check] = {
     check.registry.kind: check
     for check in (
-        check_family, check_edit, check_rule, check_layout_format, check_derived_layer, check_map_format, check_effect,
+        check_generator, check_edit, check_rule, check_layout_format, check_derived_layer, check_map_format, check_effect,
         check_pixel_optics,
         check_curve, check_cube_format, check_scene, check_pupil, check_psf_format, check_lens, check_metric,
         check_column,
@@ -101,7 +101,7 @@ def check_extension(kind: str, name: str) -> None:
     Parameters
     ----------
     kind : str
-        Kind of its registry, such as ``"effect"`` or ``"layout family"``.
+        Kind of its registry, such as ``"effect"`` or ``"layout generator"``.
     name : str
 
     Raises
@@ -114,7 +114,7 @@ def check_extension(kind: str, name: str) -> None:
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.testing.check_extension("layout family", "hexagonal")  # AssertionError for a violated property
+    >>> fs.testing.check_extension("layout generator", "hexagonal")  # AssertionError for a violated property
     """
     check = _check_of(kind)
     item, example = check.registry.find("name", name), check.registry.example(name)

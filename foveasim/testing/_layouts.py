@@ -1,4 +1,4 @@
-"""Checks of layout families, edits, design rules and derived layers."""
+"""Checks of layout generators, edits, design rules and derived layers."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _is_same(one: Layout, other: Layout) -> bool:
 
 
 @check_of(LAYOUTS)
-def check_family(extension: Extension) -> None:
+def check_generator(extension: Extension) -> None:
     """Check the sites of a generator, their reproduction, and files."""
     layout = _check_sites(extension.make())
     require(_is_same(extension.make(), layout), "must return the same layout for the same parameters")
@@ -67,7 +67,7 @@ def check_family(extension: Extension) -> None:
     provenance = layout.provenance
     require(
         provenance.get("generator") == extension.name,
-        "must record its name in the provenance; decorate it with layout_family",
+        "must record its name in the provenance; decorate it with layout_generator",
     )
     parameters = provenance["parameters"]
     missing = set(inspect.signature(extension.item).parameters) - set(parameters)

@@ -18,7 +18,7 @@ import pytest
 import foveasim as fs
 from foveasim._core.calls import CHECKED, check_arguments
 from foveasim.errors import ArgumentError, ParameterError
-from foveasim.layout import LAYOUTS, layout_family
+from foveasim.layout import LAYOUTS, layout_generator
 from foveasim.layout.generators.grid import grid as grid_of_module
 
 SITES = fs.layout.grid(3, 3, 2.0)
@@ -119,7 +119,7 @@ def test_signatures_and_examples_remain_visible():
     assert get_type_hints(fs.layout.grid)["stagger"] is bool
     assert inspect.signature(fs.Sensor).parameters["bits"].default == 8
     assert fs.view.id_map.__doc__.strip().startswith("Return the photosite under")
-    assert "@layout_family" in inspect.getsource(fs.layout.grid)
+    assert "@layout_generator" in inspect.getsource(fs.layout.grid)
     finder = DocTestFinder(exclude_empty=True)
     found = {test.name for test in finder.find(import_module("foveasim.view.id_map")) if test.examples}
     assert {"foveasim.view.id_map.id_map", "foveasim.view.id_map.site_at"} <= found
@@ -132,7 +132,7 @@ def test_checked_functions_are_pickled_by_name():
 
 
 def test_registered_generators_are_checked():
-    @layout_family(example={"side_um": 2.0})
+    @layout_generator(example={"side_um": 2.0})
     def single_site_of_test(side_um):
         return fs.Layout.from_rectangles([[0.0, 0.0]], side_um)
 

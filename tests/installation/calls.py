@@ -292,12 +292,12 @@ class Objects:
 
 
 def own_layout():
-    @fs.layout.layout_family(example={"side_um": 2.0})
-    def installation_family(side_um):
+    @fs.layout.layout_generator(example={"side_um": 2.0})
+    def installation_generator(side_um):
         return fs.layout.grid(2, 2, side_um)
 
-    del fs.layout.LAYOUTS._objects["installation_family"]
-    return installation_family(side_um=3.0)
+    del fs.layout.LAYOUTS._objects["installation_generator"]
+    return installation_generator(side_um=3.0)
 
 
 def own_edit():
@@ -490,7 +490,7 @@ CALLS = {
     "layout.hexagonal": lambda o: layout.hexagonal(3, 2, 2.0),
     "layout.inset": lambda o: layout.inset(o.plain, 0.1),
     "layout.layout_edit": lambda o: own_edit(),
-    "layout.layout_family": lambda o: own_layout(),
+    "layout.layout_generator": lambda o: own_layout(),
     "layout.log_polar": lambda o: layout.log_polar(n_sectors=16, r_max_um=50.0, min_size_um=2.0),
     "layout.merge": lambda o: layout.merge(o.plain, np.arange(64) // 8),
     "layout.merge_at": lambda o: layout.merge_at(o.plain, [[-1.0, 0.5], [1.0, 0.5]]),

@@ -163,7 +163,7 @@ def test_unknown_name_suggests_closest():
         learn.generated("log_polar", {"r_mx_um": number(3.0)})
     with pytest.raises(
         ParameterError,
-        match=r"'generator' must be the name of a layout family, got 'logpolar'; did you mean 'log_polar'",
+        match=r"'generator' must be the name of a layout generator, got 'logpolar'; did you mean 'log_polar'",
     ):
         learn.generated("logpolar", {})
 

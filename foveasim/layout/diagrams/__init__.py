@@ -1,1 +1,1 @@
-"""Voronoi and power diagrams, for the irregular layout families."""
+"""Voronoi and power diagrams, for the irregular layout generators."""

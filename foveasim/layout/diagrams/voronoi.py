@@ -1,4 +1,4 @@
-"""Voronoi cells of points in a region, as packed rings, for the irregular layout families."""
+"""Voronoi cells of points in a region, as packed rings, for the irregular layout generators."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Layout generators, one module per family, registered in :data:`foveasim.layout.LAYOUTS`."""
+"""Layout generators, one module each, registered in :data:`foveasim.layout.LAYOUTS`."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import numpy as np
 from foveasim._core.calls import LENGTH, Limits
 from foveasim._core.validation import MAX_LENGTH_UM, MAX_SITES, Floats, Ints, check_count, check_sites
 from foveasim.errors import ParameterError
-from foveasim.layout.families import layout_family
+from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.generators._annuli import points_of_outlines
 from foveasim.layout.model import Layout, layout_of
 from foveasim.layout.site_counts import SolveFor
@@ -23,7 +23,7 @@ RATIO_ROUNDING = 1e-9
 CORNER_ROUNDING = 1e-12
 
 
-@layout_family(
+@layout_generator(
     example={"n_rings": 12, "pitch_um": 1.0, "n_fovea": 4, "ring_ratio": 1.2},
     solve_for=(
         SolveFor(
@@ -39,7 +39,7 @@ def foveal_cartesian(
     ring_ratio: Annotated[float, Limits(above=1.0 + RATIO_ROUNDING)],
     pitch_um: Annotated[float, LENGTH],
     n_fovea: int = 1,
-    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
     Generate square rings of rectangles that grow geometrically around the optical axis.

@@ -14,7 +14,7 @@ from foveasim._core.validation import Floats, Ints, check_count, check_sites
 from foveasim.errors import ParameterError
 from foveasim.layout._regions import disc
 from foveasim.layout.diagrams.voronoi import voronoi_cells
-from foveasim.layout.families import layout_family
+from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.model import Layout, layout_of
 from foveasim.layout.site_counts import SolveFor
 
@@ -38,7 +38,7 @@ def _guess_rings(n_sites: int, parameters: Mapping[str, Any]) -> float:
     return 1.0 if a_um is None else math.sqrt(n_sites * math.log1p(0.5 * parameters["fov_um"] / a_um) / (2.0 * math.pi))
 
 
-@layout_family(
+@layout_generator(
     example={"fov_um": 36.0, "a_um": 3.0, "n_rings": 12},
     solve_for=(
         SolveFor(
@@ -62,7 +62,7 @@ def fovi(
     a_um: Annotated[float | None, LENGTH] = None,
     n_rings: Annotated[int | None, Limits(at_least=1, at_most=MAX_RINGS)] = None,
     n_chords: int | None = None,
-    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
     Generate isotropic rings around a central site, with a spacing that grows outwards.

@@ -17,7 +17,7 @@ import numpy as np
 from foveasim._core.calls import Limits
 from foveasim._core.validation import MAX_LENGTH_UM, MAX_SITES, check_count, check_length_um, check_sites
 from foveasim.errors import ParameterError
-from foveasim.layout.families import COUNT, layout_family
+from foveasim.layout.generator_registry import COUNT, layout_generator
 from foveasim.layout.generators._annuli import CHORDS, MIN_SITES_PER_RHO, Fovea, Ring, annuli, fovea_rings
 from foveasim.layout.generators.tiling import with_hexagons
 from foveasim.layout.model import Layout, layout_of
@@ -66,7 +66,7 @@ def _count_sites(parameters: Mapping[str, Any]) -> float | None:
     return float((n_rho - n_fovea) * n_theta + sum(ring.n_sites for ring in inside))
 
 
-@layout_family(
+@layout_generator(
     example={"n_rho": 16, "n_theta": 36, "n_fovea": 6, "n_across": 60, "unit_um": 0.6},
     solve_for=(
         SolveFor(
@@ -87,7 +87,7 @@ def giotto(
     fovea: Fovea = "rings",
     stagger: bool = True,
     chords_per_arc: Annotated[int, CHORDS] = 1,
-    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
     Generate ``n_fovea`` rings of unit height, then rings that grow by the ratio λ.

@@ -11,7 +11,7 @@ import numpy as np
 from foveasim._core.calls import LENGTH, NOT_NEGATIVE, Limits
 from foveasim._core.validation import MAX_SITES, Floats, check_length_um, check_sites, freeze
 from foveasim.errors import ParameterError
-from foveasim.layout.families import COUNT, layout_family
+from foveasim.layout.generator_registry import COUNT, layout_generator
 from foveasim.layout.lattice import RectangleLattice
 from foveasim.layout.model import Layout
 from foveasim.layout.site_counts import SolveFor
@@ -39,7 +39,7 @@ def guess_columns(n_sites: int, parameters: Mapping[str, Any]) -> float:
     return math.sqrt(n_sites * width_um / height_um)
 
 
-@layout_family(
+@layout_generator(
     example={"n_x": 14, "n_y": 14, "pitch_um": 2.0, "trench_um": 0.3, "stagger": True},
     solve_for=(SolveFor(name="n_x", guess=guess_columns, count=_count_cells),),
 )
@@ -54,7 +54,7 @@ def grid(
     trench_um: Annotated[float | None, NOT_NEGATIVE] = None,
     fill_factor: Annotated[float | None, FILL_FACTOR] = None,
     stagger: bool = False,
-    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
     Generate square or rectangular photosites in rows and columns around the optical axis.

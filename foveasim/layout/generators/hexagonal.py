@@ -10,7 +10,7 @@ import numpy as np
 
 from foveasim._core.calls import LENGTH, NOT_NEGATIVE
 from foveasim._core.validation import check_sites
-from foveasim.layout.families import COUNT, layout_family
+from foveasim.layout.generator_registry import COUNT, layout_generator
 from foveasim.layout.generators.grid import FILL_FACTOR, FIT_ROUNDING, check_field_um, linear_fill_factor
 from foveasim.layout.model import Layout
 from foveasim.layout.site_counts import SolveFor
@@ -36,7 +36,7 @@ def _guess_columns(n_sites: int, parameters: Mapping[str, Any]) -> float:
     return math.sqrt(n_sites * ROW_PITCH * width_um / height_um)
 
 
-@layout_family(
+@layout_generator(
     example={"n_columns": 14, "n_rows": 16, "pitch_um": 2.0},
     solve_for=(SolveFor(name="n_columns", guess=_guess_columns, count=_count_cells),),
 )
@@ -50,7 +50,7 @@ def hexagonal(
     trench_um: Annotated[float | None, NOT_NEGATIVE] = None,
     fill_factor: Annotated[float | None, FILL_FACTOR] = None,
     orientation: Literal["pointy", "flat"] = "pointy",
-    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
     Generate closely packed regular hexagons around the optical axis.

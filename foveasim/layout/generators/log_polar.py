@@ -12,7 +12,7 @@ from foveasim._core.calls import LENGTH, Limits
 from foveasim._core.rings import ring_area_um2
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_count, check_length_um, check_sites
 from foveasim.errors import LayoutWarning, ParameterError, warn
-from foveasim.layout.families import layout_family
+from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.generators._annuli import CHORDS, MIN_SITES_PER_RHO, Annuli, Fovea, Ring, annuli, fovea_rings
 from foveasim.layout.generators.tiling import with_hexagons
 from foveasim.layout.model import Layout, layout_of, valid_sites
@@ -66,7 +66,7 @@ def _count_sites(parameters: Mapping[str, Any]) -> float | None:
     return float(per_ring.sum() + n_sectors * (radii_um.size - 2))
 
 
-@layout_family(
+@layout_generator(
     example={"n_sectors": 36, "min_size_um": 1.0, "r_max_um": 18.0, "fovea": "hexagons"},
     solve_for=(
         SolveFor(
@@ -97,7 +97,7 @@ def log_polar(
     fovea: Fovea = "none",
     stagger: bool = False,
     chords_per_arc: Annotated[int, CHORDS] = 1,
-    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
     Generate rings of ``n_sectors`` sites that grow outwards by ``ring_ratio``.

@@ -10,7 +10,7 @@ import numpy as np
 
 from foveasim._core.calls import LENGTH
 from foveasim._core.validation import Bools, Ints, check_length_um, check_sites
-from foveasim.layout.families import COUNT, layout_family
+from foveasim.layout.generator_registry import COUNT, layout_generator
 from foveasim.layout.generators.grid import cells_in_field, guess_columns
 from foveasim.layout.model import Layout, layout_of
 from foveasim.layout.site_counts import SolveFor
@@ -33,7 +33,7 @@ def _count_cells(parameters: Mapping[str, Any]) -> float:
     return float(n_x * n_y + (n_x + more) * (n_y + more))
 
 
-@layout_family(
+@layout_generator(
     example={"n_x": 12, "n_y": 12, "pitch_um": 2.0},
     solve_for=(
         SolveFor(
@@ -51,7 +51,7 @@ def octagonal(
     size_um: tuple[float, float] | None = None,
     diamond_um: float | None = None,
     border: Literal["whole", "cut"] = "whole",
-    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
     Generate octagons on a square grid, with a diamond where four of them meet.

@@ -10,7 +10,7 @@ import numpy as np
 from foveasim._core.calls import LENGTH
 from foveasim._core.validation import MAX_SITES, Bools, Floats, Ints
 from foveasim.errors import ParameterError
-from foveasim.layout.families import layout_family
+from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.model import Layout
 from foveasim.layout.site_counts import SolveFor
 
@@ -33,7 +33,7 @@ KEY = 2 ** np.array((48, 32, 16, 0), np.int64)
 DECAGON_INRADIUS_RATIO = math.cos(math.pi / 10.0)
 
 
-@layout_family(
+@layout_generator(
     has_mosaic=False,
     example={"side_um": 2.0, "size_um": 30.0},
     solve_for=(
@@ -50,7 +50,7 @@ def penrose(
     *,
     size_um: Annotated[float, LENGTH],
     shape: Literal["disc", "square"] = "disc",
-    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
     Generate thick and thin rhombs with fivefold symmetry around the optical axis.

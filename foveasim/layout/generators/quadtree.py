@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from foveasim._core.calls import LENGTH, NOT_NEGATIVE, Limits
 from foveasim._core.validation import Bools, Floats, Ints, finite_array
 from foveasim.errors import ParameterError
-from foveasim.layout.families import layout_family
+from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.model import Layout, layout_of
 from foveasim.layout.site_counts import SolveFor
 
@@ -20,7 +20,7 @@ __all__ = ["quadtree"]
 MAX_LEVELS = 15
 
 
-@layout_family(
+@layout_generator(
     has_mosaic=False,
     example={
         "importance": np.exp(-np.hypot(*np.mgrid[-32:32, -32:32]) / 6.0),
@@ -45,7 +45,7 @@ def quadtree(
     n_levels: Annotated[int, Limits(at_least=0, at_most=MAX_LEVELS)],
     limit: Annotated[float | None, NOT_NEGATIVE] = None,
     measure: Literal["sum", "peak"] = "sum",
-    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
     Generate squares with power-of-two sides, smaller where an importance picture is larger.

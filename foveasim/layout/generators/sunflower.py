@@ -11,7 +11,7 @@ from foveasim._core.calls import LENGTH
 from foveasim._core.validation import Floats, Ints, check_count, check_length_um
 from foveasim.layout._regions import disc
 from foveasim.layout.diagrams.voronoi import voronoi_cells
-from foveasim.layout.families import SITES, layout_family
+from foveasim.layout.generator_registry import SITES, layout_generator
 from foveasim.layout.model import Layout, layout_of
 
 __all__ = ["sunflower"]
@@ -24,7 +24,7 @@ SPIRAL_FACTOR = 1.0 / math.sqrt(5.0 - 4.0 * math.cos(3.0 * GOLDEN_ANGLE_RAD))
 MIN_CHORDS = 64
 
 
-@layout_family(has_mosaic=False, example={"n_sites": 300, "spacing_um": 1.6})
+@layout_generator(has_mosaic=False, example={"n_sites": 300, "spacing_um": 1.6})
 def sunflower(
     n_sites: Annotated[int, SITES], spacing_um: Annotated[float, LENGTH], *, n_chords: int | None = None
 ) -> Layout:

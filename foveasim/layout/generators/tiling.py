@@ -15,7 +15,7 @@ from foveasim.errors import GeometryError, LayoutWarning, ParameterError, warn
 from foveasim.layout._regions import as_region, parse_region
 from foveasim.layout.drc.measurements import is_below_size
 from foveasim.layout.edits.all_sites import clip, merge_small, union
-from foveasim.layout.families import layout_family
+from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.model import Layout, derived
 from foveasim.layout.site_counts import SolveFor
 
@@ -42,7 +42,7 @@ def _guess_pitch_um(n_sites: int, parameters: Mapping[str, Any]) -> float:
     return math.sqrt(region.area / (n_sites * cell_area))
 
 
-@layout_family(
+@layout_generator(
     example={"pitch_um": 2.0, "radius_um": 14.0},
     solve_for=(SolveFor(name="pitch_um", is_integer=False, is_increasing=False, guess=_guess_pitch_um),),
 )
@@ -56,7 +56,7 @@ def tiling(
     border: Border = "merge",
     min_size_um: Annotated[float | None, LENGTH] = None,
     origin_um: tuple[float, float] = (0.0, 0.0),
-    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
     Generate equal squares or hexagons that fill a region up to its boundary.

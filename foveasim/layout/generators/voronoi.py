@@ -19,7 +19,7 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout._regions import parse_region
 from foveasim.layout.diagrams.voronoi import CellEdges, IncrementalCells, ring_edges
-from foveasim.layout.families import SITES, layout_family
+from foveasim.layout.generator_registry import SITES, layout_generator
 from foveasim.layout.model import Layout, layout_of
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ MAX_NEWTON_STEPS, MIN_DAMPING = 30, 0.01
 REGULARISATION_FACTOR, N_REGULARISATIONS = 0.25, 16
 
 
-@layout_family(
+@layout_generator(
     has_mosaic=False, example={"n_sites": 200, "size_um": (32.0, 32.0), "n_iterations": 20}, picture="density"
 )
 def voronoi(

@@ -14,7 +14,7 @@ from foveasim._core.validation import MAX_LENGTH_UM, Floats, Ints, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout._regions import as_region
 from foveasim.layout.edits.all_sites import union
-from foveasim.layout.families import layout_family
+from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.generators.grid import square_corners_um
 from foveasim.layout.generators.tiling import Cells, tiling
 from foveasim.layout.model import Layout
@@ -50,7 +50,7 @@ def _count_cells(parameters: Mapping[str, Any]) -> float | None:
     return _sites_per_pixel2(parameters) * float(parameters["n_fovea"]) ** 2
 
 
-@layout_family(
+@layout_generator(
     example={"side_um": (8.0, 16.0, 32.0), "pitch_um": (1.0, 2.0, 4.0)},
     solve_for=(
         SolveFor(
@@ -68,7 +68,7 @@ def zones(
     n_fovea: Annotated[int | None, Limits(at_least=1, at_most=MAX_PIXELS)] = None,
     outlines_um: Sequence[Any] | None = None,
     cells: Cells | Sequence[Cells] = "squares",
-    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_family
+    n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
     Generate nested zones, each with its own grid around the inner zone.

@@ -6,7 +6,7 @@ from typing import Any
 
 from foveasim._io.yaml_files import first_comment
 from foveasim.layout import LAYOUTS, MOSAICS, OPTICAL_FORMATS
-from foveasim.layout.families import summary_of
+from foveasim.layout.generator_registry import summary_of
 from foveasim.sensor import PRESETS
 from foveasim.studio._engine import MAX_SITES
 from foveasim.studio._files import Files, preset_paths, presets, thumbnail_name

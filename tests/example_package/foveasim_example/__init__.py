@@ -14,7 +14,16 @@ import foveasim as fs
 from foveasim.columns import COLUMNS, ColumnInfo
 from foveasim.config import Limits, Usual, Words
 from foveasim.distortion import LENSES
-from foveasim.layout import DERIVED_LAYERS, FORMATS, RULES, FileFormat, Rule, WrittenLayout, layout_edit, layout_family
+from foveasim.layout import (
+    DERIVED_LAYERS,
+    FORMATS,
+    RULES,
+    FileFormat,
+    Rule,
+    WrittenLayout,
+    layout_edit,
+    layout_generator,
+)
 from foveasim.maps import MAP_FORMATS, Found
 from foveasim.metrics import METRICS, MetricInfo
 from foveasim.optics import PSF_FORMATS, PUPILS, PSFGrid
@@ -24,7 +33,7 @@ from foveasim.sensor.effects import EFFECTS, AdditiveNoise, Collection
 from foveasim.sensor.spectral import CURVES
 
 
-@layout_family(example={"n_petals": 12, "petal_um": 3.0})
+@layout_generator(example={"n_petals": 12, "petal_um": 3.0})
 def daisy(
     *,
     n_petals: Annotated[int, Limits(at_least=3, at_most=1000)],

@@ -14,7 +14,7 @@ from registries import restored
 import foveasim as fs
 from foveasim.config import read_layout
 from foveasim.errors import ConfigError, LayoutWarning, ParameterError
-from foveasim.layout import LAYOUTS, layout_family
+from foveasim.layout import LAYOUTS, layout_generator
 from foveasim.layout.site_counts import SolveFor
 
 IMPORTANCE = np.array([[np.exp(-hypot(x, y) / 12.0) for x in range(-32, 32)] for y in range(-32, 32)])
@@ -153,7 +153,7 @@ def test_bad_requests_are_explained(name, parameters, message):
 
 @restored(LAYOUTS)
 def test_user_family_solves_for_parameter():
-    @layout_family(
+    @layout_generator(
         example={"n": 4},
         solve_for=(SolveFor(name="n", guess=lambda n_sites, _: n_sites**0.5),),
     )

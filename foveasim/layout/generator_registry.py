@@ -1,4 +1,4 @@
-"""Layout families: registry of generators, and provenance of generated layouts."""
+"""Registry of layout generators, and provenance of generated layouts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from foveasim.errors import SimulationError, type_name
 from foveasim.layout.model import Layout
 from foveasim.layout.site_counts import SolveFor, layout_with_n_sites, select_unknown
 
-__all__ = ["COUNT", "LAYOUTS", "SITES", "layout_family"]
+__all__ = ["COUNT", "LAYOUTS", "SITES", "layout_generator"]
 
 P = ParamSpec("P")
 
@@ -29,10 +29,10 @@ SITES = Limits(at_least=1, at_most=MAX_SITES, hint="take fewer or larger photosi
 
 #: Layout generators by their name in settings files and in :mod:`foveasim.layout`. Installed packages register more as entry
 #: points of the group ``foveasim.layouts``.
-LAYOUTS: Registry[Callable[..., Layout]] = Registry("layout family", "foveasim.layouts")
+LAYOUTS: Registry[Callable[..., Layout]] = Registry("layout generator", "foveasim.layouts")
 
 
-def layout_family(
+def layout_generator(
     *,
     example: Mapping[str, Any],
     picture: str | None = None,
@@ -45,7 +45,7 @@ def layout_family(
     Parameters
     ----------
     example : mapping
-        Parameters of a small layout, used by the gallery and by the checks of all families.
+        Parameters of a small layout, used by the gallery and by the checks of all generators.
     picture : str, optional
         Name of the parameter that is the path of a picture in settings files.
     solve_for : sequence of SolveFor
@@ -62,7 +62,7 @@ def layout_family(
 
     Examples
     --------
-    >>> @layout_family(example={"side_um": 2.0})  # doctest: +SKIP
+    >>> @layout_generator(example={"side_um": 2.0})  # doctest: +SKIP
     ... def single(*, side_um: float) -> Layout:
     ...     return Layout.from_rectangles([[0.0, 0.0]], side_um)
     >>> single(side_um=3.0).provenance["parameters"]  # doctest: +SKIP
@@ -79,7 +79,7 @@ def layout_family(
             return checked(*given.args, **given.kwargs)
 
         @functools.wraps(checked)
-        def family(*args: P.args, **kwargs: P.kwargs) -> Layout:
+        def registered(*args: P.args, **kwargs: P.kwargs) -> Layout:
             try:
                 given = signature.bind(*args, **kwargs)
             except TypeError:
@@ -91,7 +91,7 @@ def layout_family(
             else:
                 layout, given.arguments[unknown.name] = layout_with_n_sites(name, generate, unknown, given.arguments)
             if not isinstance(layout, Layout):
-                raise SimulationError(f"the layout family '{name}' must return a Layout, got {type_name(layout)}")
+                raise SimulationError(f"the layout generator '{name}' must return a Layout, got {type_name(layout)}")
             if solve_for:
                 given.arguments["n_sites"] = None  # the value that was found reproduces the layout
             own = dict(layout.provenance)
@@ -100,8 +100,8 @@ def layout_family(
             return layout.with_provenance({"generator": name, "parameters": parameters, **own})
 
         for fact, value in (("picture", picture), ("solve_for", tuple(solve_for)), ("has_mosaic", has_mosaic)):
-            setattr(family, fact, value)
-        return LAYOUTS.register(name, family, example=example)
+            setattr(registered, fact, value)
+        return LAYOUTS.register(name, registered, example=example)
 
     return decorate
 
