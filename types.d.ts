@@ -132,34 +132,44 @@ interface Part {
 type Boundary = (context: CanvasRenderingContext2D, toX: (x: number) => number, toY: (y: number) => number) => void;
 
 // -- messages to the server; Connection.send adds their numbers -------------------------------------------------------------
+// python tests/reference/page_messages.py writes them, from foveasim/studio/_messages/models.py.
 
 type Change =
-  | { do: "undo" | "redo" | "match" | "fit" }
-  | { do: "set"; key: string; value: unknown; final: boolean }
-  | { do: "assign"; values: { key: string; value: unknown }[] }
-  | { do: "sweep"; settings: unknown[] | undefined; results: unknown[] | undefined }
-  | { do: "stop_sweep" | "sweep_file" }
-  | { do: "reset" | "delete"; key: string }
-  | { do: "preset" | "solve"; name: string }
-  | { do: "new_sensor"; generator: string; size_um: number[]; n_sites: number; filters: string | null; electronics: string }
-  | { do: "pin"; sites: number[] }
-  | { do: "seek"; key: string; requirement: { [name: string]: unknown } | undefined }
-  | { do: "save"; name: string; may_replace?: boolean }
-  | { do: "restore"; settings: Settings | undefined }
-  | { do: "file"; path: string | undefined; as: string }
+  | { do: "set"; key: string; value?: unknown; final?: boolean }
+  | { do: "assign"; values: { key: string; value?: unknown }[] }
+  | { do: "reset"; key: string }
+  | { do: "delete"; key: string }
+  | { do: "seek"; key: string; requirement: { [name: string]: unknown } | undefined; bounds?: number[] | null }
+  | { do: "solve"; name: string }
+  | { do: "fit" }
+  | { do: "match" }
+  | { do: "apply"; variant: string }
+  | { do: "preset"; name: string }
+  | { do: "new_sensor"; generator: string; size_um: number[]; n_sites: number; filters?: string | null; electronics: string }
+  | { do: "restore"; settings: { [name: string]: unknown } | undefined }
+  | { do: "file"; path: string | undefined; as: "scene" | "layout" | "settings" }
   | { do: "video"; path: string | undefined }
   | { do: "frame"; n: number; follows?: boolean; final?: boolean }
-  | { do: "follow"; t_s: number; final: boolean }
+  | { do: "follow"; t_s: number; final?: boolean }
   | { do: "gaze_file"; path: string | undefined }
-  | { do: "saccades" }  // with the parameters of the path
-  | { do: "views"; names: string[]; pixels: number }
-  | { do: "freeze"; variant?: string }
+  | { do: "saccades"; seed?: number | null; duration_s?: number | null; fixation_s?: number | null; drift_um_per_root_s?: number | null }
+  | { do: "undo" }
+  | { do: "redo" }
+  | { do: "refresh" }
+  | { do: "views"; names: string[]; pixels?: number | null }
+  | { do: "pin"; sites: number[] }
+  | { do: "freeze"; variant?: string | null }
   | { do: "unfreeze" }
   | { do: "variant"; action: "keep" | "update" | "describe" | "delete"; variant?: string; name?: string; note?: string }
-  | { do: "apply"; variant: string }
   | { do: "compare"; variants: string[] }
-  | { do: "text"; what: string };
-interface FrameHeader { width: number; height: number; is_first: boolean }
+  | { do: "sweep"; settings: { key: string; [name: string]: unknown }[] | undefined; results: { [name: string]: unknown }[] | undefined }
+  | { do: "stop_sweep" }
+  | { do: "sweep_file" }
+  | { do: "text"; what: string }
+  | { do: "save"; name: string; may_replace?: boolean }
+  | { do: "drawn"; version: number }
+  | { do: "cancel" };
+interface FrameHeader { is_first?: boolean; width: number; height: number }
 
 // -- parts of pages -----------------------------------------------------------------------------------------------------------
 

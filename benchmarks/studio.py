@@ -23,7 +23,7 @@ from report import Report
 from rich.console import Console
 
 from foveasim.studio import TOKEN_VARIABLE
-from foveasim.studio._messages import decode_part
+from foveasim.studio._messages.encoding import decode_part
 
 N_CHANGES, N_QUICK = 50, 5
 #: Sensors by number of photosites: settings that differ from the demo.

@@ -6,20 +6,27 @@ import difflib
 import io
 import json
 import re
+import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from foveasim import __version__
+from foveasim._io.atomic import atomic_write
 from foveasim._io.yaml_files import format_yaml
 from foveasim.config import get_setting, to_python
-from foveasim.errors import FoveasimError, ParameterError, printable
+from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.layout import Layout, write_layout
-from foveasim.studio._messages import to_json
+from foveasim.studio._files import file_name, is_unused_or_copy, unused_path
+from foveasim.studio._messages.encoding import to_json
+from foveasim.studio._messages.models import Save, SendText, handles
 from foveasim.studio._settings.changes import changed_keys
+
+if TYPE_CHECKING:
+    from foveasim.studio._session import Session
 
 #: Date of the files in archives, so that equal states have equal archives; the earliest that the format can represent.
 DATE = (1980, 1, 1, 0, 0, 0)
@@ -150,10 +157,10 @@ def archive(name: str, texts: Mapping[str, str], files: Mapping[str, Path], layo
     """
     content = io.BytesIO()
     with tempfile.TemporaryDirectory(prefix="foveasim-studio-") as directory, zipfile.ZipFile(content, "w") as file:
-        for file_name, text in texts.items():
-            _add(file, file_name, text.encode())
-        for file_name, path in files.items():
-            _add(file, file_name, path.read_bytes())
+        for text_name, text in texts.items():
+            _add(file, text_name, text.encode())
+        for copied, path in files.items():
+            _add(file, copied, path.read_bytes())
         if layout is not None:
             path = _write_layout(layout, Path(directory) / f"{name}_layout")
             _add(file, path.name, path.read_bytes())
@@ -173,3 +180,50 @@ def _add(file: zipfile.ZipFile, name: str, content: bytes) -> None:
     entry = zipfile.ZipInfo(name, DATE)
     entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, PERMISSIONS
     file.writestr(entry, content)
+
+
+def save(session: Session, path: Path, text: str = "") -> None:
+    """
+    Write the settings of a session to a file, with copies of uploaded files next to it.
+
+    ``text``: comments at the beginning of the file.
+    """
+    out = path.parent
+    out.mkdir(parents=True, exist_ok=True)
+    originals = {path: path}
+
+    def name_of(original: Path) -> str:
+        """Return a name that no other file has, of these settings or of those saved before."""
+
+        def is_usable(copied: Path) -> bool:
+            return originals.get(copied, original) == original and is_unused_or_copy(copied, original)
+
+        copied = unused_path(out / original.name, is_usable)
+        originals[copied] = original
+        return copied.name
+
+    settings, files = session.exported(name_of)
+    for copied, original in files.items():
+        with atomic_write(out / copied) as temporary:
+            shutil.copyfile(original, temporary)
+    with atomic_write(path) as temporary:
+        temporary.write_text(text + format_yaml(settings), encoding="utf-8")
+
+
+@handles(Save)
+def _save(session: Session, message: Save) -> None:
+    out, safe = session.start.out, file_name(message.name)
+    if out is None:
+        raise SimulationError("files are written only with --out; use the download instead")
+    path = out / (safe if safe.endswith((".yaml", ".yml")) else f"{safe}.yaml")
+    if path.exists() and not message.may_replace:
+        session.send({"kind": "exists", "id": message.id, "name": message.name, "file": path.name})
+    else:
+        save(session, path)
+        session.send({"kind": "saved", "id": message.id, "path": str(path)})
+
+
+@handles(SendText)
+def _send_text(session: Session, message: SendText) -> None:
+    exported = session.exported()
+    session.send_text(message.id, message.what, session.text(message.what, exported), list(exported[1]))

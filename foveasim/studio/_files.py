@@ -8,7 +8,7 @@ import re
 import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,6 +26,10 @@ from foveasim.config._models import expand_preset
 from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS
 from foveasim.errors import FileError, ParameterError, SimulationError, printable
 from foveasim.scene import Scene
+from foveasim.studio._messages.models import ApplyPreset, FitScene, RestoreSettings, handles
+
+if TYPE_CHECKING:
+    from foveasim.studio._session import Session
 
 #: Size of the image of a fitted scene, relative to the photosites: second-order integration needs a further cell.
 MARGIN = 1.01
@@ -257,3 +261,18 @@ def unused_path(path: Path, is_usable: Callable[[Path], bool]) -> Path:
 def is_unused_or_copy(path: Path, original: Path) -> bool:
     """Return whether a path is unused, or that of a file with the content of the original."""
     return not path.exists() or (path.is_file() and filecmp.cmp(original, path, shallow=False))
+
+
+@handles(ApplyPreset)
+def _apply_preset(session: Session, message: ApplyPreset) -> dict[str, Any]:
+    return apply_preset(message.name, session.history.settings)
+
+
+@handles(FitScene)
+def _fit_scene(session: Session, _message: FitScene) -> dict[str, Any]:
+    return with_covering_scene(session.history.settings, session.required_result("fit").shot)
+
+
+@handles(RestoreSettings)
+def _restore(session: Session, message: RestoreSettings) -> Any:
+    return session.files.with_uploads(message.settings)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import json
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,11 @@ from foveasim._io.images import write_picture
 from foveasim._io.videos import SandboxedVideo
 from foveasim.config._video import DEFAULT_FRAME_S
 from foveasim.errors import FileError, ParameterError
+from foveasim.studio._messages.models import CameraFrame, OpenVideo, ShowFrame, handles
+from foveasim.studio._settings.changes import with_picture
+
+if TYPE_CHECKING:
+    from foveasim.studio._session import Session
 
 #: Largest size of the decoded frames that are stored for steps back.
 MAX_DECODED_BYTES = 64 << 20
@@ -29,24 +33,22 @@ DIGEST_LENGTH = 8
 HIDDEN = ".frames"
 
 
-def camera_frame(message: bytes) -> dict[str, Any]:
+def camera_frame(message: bytes) -> CameraFrame:
     """
     Decode a camera frame.
 
     ``message``: length of the header as little-endian uint32; header in JSON with ``id``, ``width``, ``height`` and
-    ``is_first``; pixels, RGB, uint8, top row first. Returns ``message``: with ``pixels``, (n_y, n_x, 3) uint8. Raises
-    ParameterError when the message is invalid.
+    ``is_first``; pixels, RGB, uint8, top row first. Raises ParameterError when the message is invalid.
     """
     start = 4 + int.from_bytes(message[:4], "little")
     try:
-        header = json.loads(message[4:start])
-        width, height = header["width"], header["height"]
-        if not (type(width) is int and type(height) is int and 0 < width * height <= MAX_CAMERA_PIXELS and width > 0):
+        frame = CameraFrame.model_validate_json(message[4:start])
+        if frame.width * frame.height > MAX_CAMERA_PIXELS:
             raise ValueError
-        pixels = np.frombuffer(message, np.uint8, offset=start).reshape(height, width, 3)
-    except (ValueError, TypeError, KeyError, RecursionError):
+        frame.pixels = np.frombuffer(message, np.uint8, offset=start).reshape(frame.height, frame.width, 3)
+    except ValueError:
         raise ParameterError("frame", "must be a header and the pixels that it specifies") from None
-    return {"do": "frame", "id": header.get("id"), "is_first": header.get("is_first") is True, "pixels": pixels}
+    return frame
 
 
 class Frames:
@@ -106,7 +108,7 @@ class Frames:
         self._use(0 if is_first else self._number + 1, pixels)
         return True
 
-    def show(self, number: object) -> None:
+    def show(self, number: int) -> None:
         """
         Decode a frame of the video.
 
@@ -114,7 +116,7 @@ class Frames:
         """
         if self._video is None:
             raise ParameterError("n", "must be the number of a frame of an open video")
-        if type(number) is not int or not 0 <= number < self._n_frames:
+        if not 0 <= number < self._n_frames:
             raise ParameterError("n", f"must be 0 to {self._n_frames - 1}")
         if number not in self._decoded:
             self._decode(number)
@@ -238,3 +240,26 @@ class Frames:
         for file in self.export(settings).values():
             settings = {**settings, "scene": {**settings["scene"], "picture": str(file)}}
         return settings
+
+
+@handles(OpenVideo)
+def _open_video(session: Session, message: OpenVideo) -> dict[str, Any]:
+    path = Path(session.files.available(message.path))
+    shown = session.frames.path if session.frames.open_video(path) else path
+    return with_picture(session.history.settings, session.start.settings, str(shown))
+
+
+@handles(ShowFrame)
+def _show_frame(session: Session, message: ShowFrame) -> dict[str, Any] | None:
+    settings = session.history.settings
+    if message.follows:
+        session.gaze.required_path(settings)  # an error leaves the frame
+    session.frames.show(message.n)
+    return session.gaze.at(settings, session.frames.time_s) if message.follows else None
+
+
+@handles(CameraFrame)
+def _receive_frame(session: Session, message: CameraFrame) -> dict[str, Any] | None:
+    if not session.frames.receive(message.pixels, is_first=message.is_first) or not message.is_first:
+        return None
+    return with_picture(session.history.settings, session.start.settings, str(session.frames.path))

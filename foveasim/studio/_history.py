@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from foveasim.errors import SimulationError
+from foveasim.studio._messages.models import Redo, Undo, handles
+
+if TYPE_CHECKING:
+    from foveasim.studio._session import Session
 
 #: Largest number of undo steps; earlier ones are discarded.
 MAX_STEPS = 1000
@@ -97,3 +103,10 @@ class History:
         other._past, other._future = self._past, self._future
         other._present, other._draft = self._present, self._draft
         return other
+
+
+@handles(Undo)
+@handles(Redo)
+def _step(session: Session, message: Undo | Redo) -> None:
+    if not (session.history.undo() if isinstance(message, Undo) else session.history.redo()):
+        raise SimulationError(f"there is no step to {message.do}")

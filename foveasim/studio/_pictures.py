@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,35 @@ def resolved_pixels(shot: Shot) -> int:
     lambda_n_um = 0.4 * shot.camera.optics.f_number  # at 400 nm
     pixel_um = max(float(np.sqrt(layout.area_um2.min())) / PER_SITE, lambda_n_um / PER_LAMBDA_N)
     return int(np.clip(math.ceil(max(x1_um - x0_um, y1_um - y0_um) / pixel_um), MIN_PIXELS, MAX_PIXELS))
+
+
+class ReducedPictures:
+    """
+    Reduced copies of large pictures, with sentences about them.
+
+    ``new_path``: returns an unused path for a name.
+    """
+
+    def __init__(self, new_path: Callable[[str], Path]) -> None:
+        self._new_path = new_path
+        self._notes: dict[str, str] = {}
+        self._found: dict[tuple[str, int, Encoding], tuple[Path, str] | None] = {}
+
+    def path_of(self, path: str, shot: Shot, encoding: Encoding) -> str:
+        """Return the path of a picture, or of a reduced one if a shot cannot resolve its pixels."""
+        key = (path, resolved_pixels(shot), encoding)
+        if key not in self._found:
+            self._found[key] = reduced_picture(Path(path), self._new_path, key[1], encoding)
+        found = self._found[key]
+        if found is None:
+            return path
+        self._notes[str(found[0])] = found[1]
+        return str(found[0])
+
+    def notes_of(self, settings: Mapping[str, Any]) -> list[str]:
+        """Return the sentences about the picture of settings."""
+        picture = settings.get("scene", {}).get("picture")
+        return [note for path, note in self._notes.items() if picture == path]
 
 
 def reduced_picture(

@@ -35,7 +35,7 @@ from foveasim.layout import write_layout
 from foveasim.studio._exports import archive
 from foveasim.studio._files import file_name, presets
 from foveasim.studio._frames import camera_frame
-from foveasim.studio._messages import is_answer_to_freeze, one_line
+from foveasim.studio._messages.encoding import is_answer_to_freeze, one_line
 from foveasim.studio._session import MAX_SESSION_BYTES, Session, Start
 from foveasim.studio._start import contents_of
 
@@ -150,7 +150,7 @@ class Studio:
             idle = [each for each in self.sessions.values() if each.is_idle]
             if not idle:
                 return None, True
-            oldest = min(idle, key=lambda each: each.last_used_s)
+            oldest = min(idle, key=lambda each: each.queue.last_used_s)
             self.sessions.pop(oldest.name).close()
         session = Session(secrets.token_urlsafe(12), self.start, origin=origin)
         session.page = page
@@ -161,7 +161,7 @@ class Studio:
         """Close sessions without a page."""
         now_s = time.monotonic()
         for name, session in list(self.sessions.items()):
-            if session.is_idle and now_s - session.last_used_s > idle_s:
+            if session.is_idle and now_s - session.queue.last_used_s > idle_s:
                 self.sessions.pop(name).close()
 
     async def free_idle_sessions(self) -> None:

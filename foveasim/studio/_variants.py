@@ -6,13 +6,20 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from foveasim._io.atomic import atomic_write
 from foveasim._io.yaml_files import read_text, read_yaml
 from foveasim.config import resolve_files
-from foveasim.errors import FileError, ParameterError, printable
+from foveasim.errors import FileError, FoveasimError, ParameterError, printable
+from foveasim.studio._engine import Simulated
 from foveasim.studio._files import file_name, unused_path, with_preset
+from foveasim.studio._messages.models import ApplyVariant, ChangeVariant, CompareVariants, Freeze, Unfreeze, handles
+from foveasim.studio._parts import PARTS, summary_of
+from foveasim.studio._parts.comparison import FROZEN
+
+if TYPE_CHECKING:
+    from foveasim.studio._session import Session
 
 #: Directory of the variants, in that of saved files.
 DIRECTORY = "variants"
@@ -54,23 +61,18 @@ class Variants:
         paths = [path for path in self.directory.glob(f"*{EXTENSION}") if not path.name.startswith(".")]
         return iter(sorted((_described(path) for path in paths), key=lambda each: (_in_order(each.name), each.id)))
 
-    def path_of(self, variant: Any) -> Path:
+    def path_of(self, variant: str) -> Path:
         """
         Return the file of a variant.
 
         Raises ParameterError when there is no such variant.
         """
         path = self.directory / f"{variant}{EXTENSION}"
-        if (
-            not isinstance(variant, str)
-            or variant != Path(variant).name
-            or variant.startswith(".")
-            or not path.is_file()
-        ):
-            raise ParameterError("variant", "must be one of the session", printable(str(variant))[:40])
+        if variant != Path(variant).name or variant.startswith(".") or not path.is_file():
+            raise ParameterError("variant", "must be one of the session", printable(variant)[:40])
         return path
 
-    def keep(self, name: Any, note: Any = "") -> str:
+    def keep(self, name: str, note: str = "") -> str:
         """
         Keep the present state as a variant, and return its identifier.
 
@@ -81,25 +83,25 @@ class Variants:
             raise ParameterError("variants", f"must be at most {MAX_VARIANTS}; delete some first")
         self.directory.mkdir(parents=True, exist_ok=True)
         path = unused_path(
-            self.directory / f"{file_name(str(name)).replace('.', '_')}{EXTENSION}", lambda each: not each.exists()
+            self.directory / f"{file_name(name).replace('.', '_')}{EXTENSION}", lambda each: not each.exists()
         )
         self._write(path, text)
         return path.stem
 
-    def update(self, variant: Any) -> None:
+    def update(self, variant: str) -> None:
         """Replace the state of a variant by the present one."""
         path = self.path_of(variant)
         found = _described(path)
         self._write(path, _comments(found.name, found.note))
 
-    def describe(self, variant: Any, name: Any, note: Any) -> None:
+    def describe(self, variant: str, name: str, note: str) -> None:
         """Change the name and the note of a variant."""
         path, text = self.path_of(variant), _comments(name, note)
         settings = _COMMENTS.sub("", read_text(path), count=1)
         with atomic_write(path) as temporary:
             temporary.write_text(text + settings, encoding="utf-8")
 
-    def delete(self, variant: Any) -> None:
+    def delete(self, variant: str) -> None:
         """Delete a variant, and the pictures that no other one contains."""
         path = self.path_of(variant)
         own = _files_of(path)
@@ -109,7 +111,7 @@ class Variants:
             if file.parent == self.directory:
                 file.unlink(missing_ok=True)
 
-    def settings_of(self, variant: Any) -> dict[str, Any]:
+    def settings_of(self, variant: str) -> dict[str, Any]:
         """
         Return the settings of a variant, with absolute paths.
 
@@ -144,11 +146,11 @@ def _described(path: Path) -> Variant:
     return Variant(path.stem, (name or path.stem)[:MAX_NAME_LENGTH], "\n".join(note)[:MAX_NOTE_LENGTH])
 
 
-def _comments(name: Any, note: Any) -> str:
+def _comments(name: str, note: str) -> str:
     """Return a name and a note as comments of YAML."""
-    if not isinstance(name, str) or not 0 < len(name.strip()) <= MAX_NAME_LENGTH:
+    if not 0 < len(name.strip()) <= MAX_NAME_LENGTH:
         raise ParameterError("name", f"must have 1 to {MAX_NAME_LENGTH} characters")
-    if not isinstance(note, str) or len(note) > MAX_NOTE_LENGTH:
+    if len(note) > MAX_NOTE_LENGTH:
         raise ParameterError("note", f"must have at most {MAX_NOTE_LENGTH} characters")
     lines = [" ".join(name.split()), *note.strip().splitlines()]
     return "".join(f"{COMMENT}{printable(line)}".rstrip() + "\n" for line in lines)
@@ -157,3 +159,112 @@ def _comments(name: Any, note: Any) -> str:
 def _in_order(name: str) -> list[tuple[int, str]]:
     """Return a key in which numbers have the order of their values."""
     return [(int(part), "") if part.isdecimal() else (0, part.casefold()) for part in re.split(r"(\d+)", name)]
+
+
+class Compared:
+    """Results of A, which is frozen, and of variants that are compared with the current state."""
+
+    def __init__(self) -> None:
+        #: Summary and settings of A.
+        self.frozen: dict[str, Any] | None = None
+        self.frozen_result: Simulated | None = None
+        #: Settings and results of variants, and the errors of others.
+        self.results: dict[str, tuple[dict[str, Any], Simulated]] = {}
+        self.problems: dict[str, str] = {}
+
+    def release(self) -> None:
+        """Release the results; A is simulated again for the next page."""
+        self.frozen_result, self.results = None, {}
+
+    def simulate_frozen(self, simulate: Callable[[dict[str, Any]], Simulated]) -> None:
+        """Simulate A again, whose result was released; without its files it is removed."""
+        if self.frozen is None or self.frozen_result is not None:
+            return
+        try:
+            self.frozen_result = simulate(self.frozen["settings"])
+        except FoveasimError:
+            self.frozen = None
+
+    def shown(self, variants: Variants) -> tuple[tuple[str, Simulated], ...]:
+        """Return the names and results of those that are compared, A first."""
+        names = {each.id: each.name for each in variants} if self.results else {}
+        named = [(names.get(variant, variant), result) for variant, (_, result) in self.results.items()]
+        return (*(() if self.frozen_result is None else ((FROZEN, self.frozen_result),)), *named)
+
+    def about(self, variants: Variants) -> list[dict[str, Any]]:
+        """Return all variants as plain data."""
+        return [
+            {**vars(each), "is_compared": each.id in self.results, "problem": self.problems.get(each.id)}
+            for each in variants
+        ]
+
+
+@handles(ApplyVariant)
+def _apply(session: Session, message: ApplyVariant) -> dict[str, Any]:
+    return session.variants.settings_of(message.variant)
+
+
+@handles(Freeze)
+def _freeze(session: Session, message: Freeze) -> None:
+    """Keep a result as A; the page keeps what is sent before the next change."""
+    current, settings = session.complete_result(), session.history.settings
+    if message.variant is not None:
+        session.send({"kind": "busy"})
+        settings = session.files.resolve(session.variants.settings_of(message.variant))
+        session.use(session.engine.simulate(settings))
+    frozen = session.required_result("freeze")
+    session.compared.frozen_result = frozen
+    session.compared.frozen = {"summary": summary_of(frozen), "settings": settings}
+    session.send_parts(is_freeze=True, is_followed=message.variant is not None)
+    if message.variant is not None:
+        session.use(current)
+
+
+@handles(Unfreeze)
+def _unfreeze(session: Session, _message: Unfreeze) -> None:
+    session.compared.frozen = session.compared.frozen_result = None
+    _forget_views(session)
+
+
+@handles(ChangeVariant)
+def _change(session: Session, message: ChangeVariant) -> None:
+    match message.action:
+        case "keep":
+            session.variants.keep(message.name, message.note)
+        case "update":
+            session.variants.update(message.variant)
+        case "describe":
+            session.variants.describe(message.variant, message.name, message.note)
+        case "delete":
+            session.variants.delete(message.variant)
+    _simulate_compared(session, [each.id for each in session.variants if each.id in session.compared.results])
+
+
+@handles(CompareVariants)
+def _compare(session: Session, message: CompareVariants) -> None:
+    _simulate_compared(session, message.variants)
+
+
+def _simulate_compared(session: Session, wanted: list[str]) -> None:
+    """Simulate variants that are compared; those that fail are left out, with the reason."""
+    session.send({"kind": "busy"})
+    compared = session.compared
+    before, compared.results, compared.problems = compared.results, {}, {}
+    for variant in dict.fromkeys(wanted):
+        try:
+            settings = session.files.resolve(session.variants.settings_of(variant))
+            known = before.get(variant)
+            if known is None or known[0] != settings:
+                known = settings, session.engine.simulate(settings)
+            compared.results[variant] = known
+        except FoveasimError as error:
+            compared.problems[variant] = session.line(error)
+    _forget_views(session)
+
+
+def _forget_views(session: Session) -> None:
+    """Send views of variants again when the next variant is compared."""
+    if not session.compared.shown(session.variants):
+        for part in PARTS.values():
+            if part.is_of_variants:
+                session.views.forget(part.name)

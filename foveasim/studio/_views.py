@@ -6,7 +6,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import ref
 
 from foveasim.config import Shot
@@ -14,14 +14,16 @@ from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.studio._costs import Costs
 from foveasim.studio._engine import PICTURE_PIXELS, Simulated
-from foveasim.studio._messages import encode_part
+from foveasim.studio._messages.encoding import encode_part
+from foveasim.studio._messages.models import PinSites, Refresh, SelectViews, handles
 from foveasim.studio._parts import PARTS, Part, PartData
 from foveasim.studio._parts.registry import FIRST_TILE
 
+if TYPE_CHECKING:
+    from foveasim.studio._session import Session
+
 #: Parts that are sent first and together: sites, and their values.
 FIRST = ("sites", "columns", "signals")
-#: Limit of the longer side of pictures.
-MAX_PIXELS = 2048
 #: The page draws the parts of a change in one frame if those after the photosites are expected within the first time, and
 #: otherwise those of the second: each frame takes a browser tens of milliseconds.
 SOON_S, TOGETHER_S = 0.04, 0.1
@@ -54,16 +56,13 @@ class Views:
         self._version: dict[str, int] = {}
         self._layout: ref[Layout] | None = None
 
-    def select(self, names: Any, pixels: Any = None) -> None:
+    def select(self, names: list[str], pixels: int | None = None) -> None:
         """
         Set the views that are sent.
 
-        ``pixels``: longer side of pictures. Raises ParameterError when a name is unknown, or the number of pixels out of
-        range.
+        ``pixels``: longer side of pictures. Raises ParameterError when a name is unknown.
         """
-        if pixels is not None and (type(pixels) is not int or not 1 <= pixels <= MAX_PIXELS):
-            raise ParameterError("pixels", f"must be an integer from 1 to {MAX_PIXELS}")
-        if not isinstance(names, list) or not all(isinstance(name, str) and name in PARTS for name in names):
+        if not set(names) <= set(PARTS):
             raise ParameterError("names", f"must be a list of names of views: {', '.join(PARTS)}")
         self._names = [name for name in PARTS if name in names]
         self._pixels = self._pixels if pixels is None else pixels
@@ -183,3 +182,18 @@ def _is_same(old: list[Any], new: tuple[Any, ...]) -> bool:
         a() is b if isinstance(a, ref) else a is b or (isinstance(b, tuple) and a == b)
         for a, b in zip(old, new, strict=True)
     )
+
+
+@handles(Refresh)
+def _refresh(session: Session, _message: Refresh) -> None:
+    session.send_again()
+
+
+@handles(SelectViews)
+def _select(session: Session, message: SelectViews) -> None:
+    session.views.select(message.names, message.pixels)
+
+
+@handles(PinSites)
+def _pin(session: Session, message: PinSites) -> None:
+    session.pinned = tuple(dict.fromkeys(each for each in message.sites if each >= 0))

@@ -9,7 +9,8 @@ import pytest
 from browsers import watch
 
 from foveasim.studio import _session
-from foveasim.studio._messages import decode_part
+from foveasim.studio._messages.encoding import decode_part
+from foveasim.studio._messages.models import read_message
 from foveasim.studio._session import Session, Start
 
 SETTINGS = {
@@ -39,7 +40,7 @@ class Recorder:
 
     def __init__(self, session, views=FEW_VIEWS):
         if views is not None:
-            session._views.select(list(views))
+            session.views.select(list(views))
         self.session = session
         self.messages, self.parts = [], []
         session._listeners[self._receive] = False
@@ -57,7 +58,7 @@ class Recorder:
     def handle(self, messages):
         self.messages.clear()
         self.parts.clear()
-        self.session._handle(messages)
+        self.session._handle([read_message(message) for message in messages])
         states = [message for message in self.messages if message["kind"] == "state"]
         return states[-1] if states else None
 

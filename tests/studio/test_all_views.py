@@ -17,7 +17,7 @@ pytest.importorskip("uvicorn")
 from studio.page_tools import change, has_picture, set_value, settle, until
 
 from foveasim.studio._engine import Engine
-from foveasim.studio._messages import encode_part
+from foveasim.studio._messages.encoding import encode_part
 from foveasim.studio._parts import PARTS, Part
 from foveasim.studio._parts.registry import capture_of
 

@@ -217,7 +217,7 @@ def test_duplicated_tab_is_a_copy(visit):
 def test_silent_server_is_not_shown_as_ready(visit, server):
     page = visit()
     name = page.evaluate("sessionStorage.getItem('foveasim-studio-session')")
-    with server.studio.sessions[name]._wake:  # no message is accepted
+    with server.studio.sessions[name].queue.wake:  # no message is accepted
         control(page, "optics.f_number").fill("4")
         control(page, "optics.f_number").press("Enter")
         until(page, "() => document.body.classList.contains('silent')")
@@ -234,9 +234,9 @@ def test_change_of_a_broken_connection_is_repeated(browser, tmp_path, visit):
         page = visit(is_checked=False, address=own.address)
         settle(page)
         session = next(iter(own.studio.sessions.values()))
-        session._is_closed = True  # messages are accepted, and not answered
-        with session._wake:
-            session._wake.notify_all()
+        session.queue.is_closed = True  # messages are accepted, and not answered
+        with session.queue.wake:
+            session.queue.wake.notify_all()
         session._thread.join(DEADLINE_S)
         control(page, "optics.f_number").fill("4")
         control(page, "optics.f_number").press("Enter")
@@ -253,15 +253,15 @@ def test_change_of_a_broken_connection_is_repeated(browser, tmp_path, visit):
 def test_long_work_is_cancelled(visit, server, monkeypatch):
     page = visit()
     before = codes(page)
-    check = Session._check
+    check = Session.check
 
     def slow(session, stage):
-        wait_until(lambda: session._is_cancelled)
+        wait_until(lambda: session.queue.is_cancelled)
         check(session, stage)
 
-    monkeypatch.setattr(Session, "_check", slow)
+    monkeypatch.setattr(Session, "check", slow)
     session = server.studio.sessions[page.evaluate("sessionStorage.getItem('foveasim-studio-session')")]
-    monkeypatch.setattr(session.engine._runner, "check", session._check)
+    monkeypatch.setattr(session.engine._runner, "check", session.check)
     field_of = control(page, "layout.parameters.n_sectors")
     field_of.fill("64")
     field_of.press("Enter")

@@ -113,13 +113,23 @@ def test_frames_use_constant_disk_and_cache(recorder, clip):
 
 
 @pytest.mark.slow(keep=1)
-@pytest.mark.parametrize("n", [10, -1, 1.0, True, None, "1"])
-def test_missing_frames_give_one_line(recorder, clip, n):
+@pytest.mark.parametrize(
+    ("n", "text"),
+    [
+        (10, "'n' must be 0 to 9"),
+        (-1, "'n' must be 0 to 9"),
+        (1.0, "'n' must be the number of a frame, got 1.0"),
+        (True, "'n' must be the number of a frame, got True"),
+        (None, "'n' must be the number of a frame"),
+        ("1", "'n' must be the number of a frame, got '1'"),
+    ],
+)
+def test_missing_frames_give_one_line(recorder, clip, n, text):
     opened(recorder, clip)
     before = codes(recorder)
     state = recorder.do(do="frame", n=n, id=5)
 
-    assert state["errors"] == {"frame": "'n' must be 0 to 9"}
+    assert state["errors"] == {"frame": text}
     assert np.array_equal(codes(recorder), before)
 
 
@@ -209,9 +219,9 @@ def test_camera_frames_replace_the_scene(recorder):
 def test_camera_frames_that_wait_are_replaced(recorder):
     for k in range(5):
         recorder.session.post(camera_frame(message(k, is_first=k == 0)))
-    (waiting,) = recorder.session._waiting
+    (waiting,) = recorder.session.queue.waiting
 
-    assert (waiting["id"], waiting["is_first"]) == (4, True)
+    assert (waiting.id, waiting.is_first) == (4, True)
 
 
 @pytest.mark.parametrize(

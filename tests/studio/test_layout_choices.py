@@ -18,7 +18,7 @@ from foveasim.studio._settings.unknowns import unknown_of, unknowns_of, with_unk
 
 
 def choose(recorder, label, **message):
-    control = next(each for each in recorder.session._controls if each["id"] == "layout")
+    control = next(each for each in recorder.session.controls if each["id"] == "layout")
     value = next(choice["value"] for choice in control["choices"] if choice["label"] == label)
     return recorder.do(do="set", key="layout", value=value, final=True, **message)
 

@@ -106,7 +106,7 @@ def test_cancelled_start_is_repeated(make_session, settings):
     """Cancelling the first simulation leaves no flag behind."""
     recorder = make_session()
     recorder.session.result = None
-    recorder.session.engine = type(recorder.session.engine)(n_threads=1, check=recorder.session._check)
+    recorder.session.engine = type(recorder.session.engine)(n_threads=1, check=recorder.session.check)
     receive = recorder._receive
 
     def cancel(message):

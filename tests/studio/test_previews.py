@@ -12,10 +12,11 @@ from studio.conftest import ALL_VIEWS
 from waiting import DEADLINE_S, wait_until
 
 from foveasim.config import build_shot
-from foveasim.studio import _engine, _session
+from foveasim.studio import _engine, _queue, _session
 from foveasim.studio._costs import Costs, SupersededError
 from foveasim.studio._engine import Engine, block_means
-from foveasim.studio._messages import decode_part
+from foveasim.studio._messages.encoding import decode_part
+from foveasim.studio._messages.models import SetValue, ShowFrame
 from foveasim.studio._session import Session, Start
 
 
@@ -136,12 +137,12 @@ def test_fast_settings_have_no_previews(large, make_session):
     assert not state["is_preview"]
     # The time of a complete simulation is known after the first step.
     recorder.do(do="set", key="optics.f_number", value=4.0, final=True)
-    recorder.session._costs._simulation_s["optics.f_number"] = 0.02
+    recorder.session.costs._simulation_s["optics.f_number"] = 0.02
     assert not drag(recorder, 5.0)[-1]["is_preview"]
 
 
 def test_slow_views_wait_while_dragging(recorder):
-    recorder.session._costs.add_part("layout.parameters.pitch_um", "picture", 0.5)
+    recorder.session.costs.add_part("layout.parameters.pitch_um", "picture", 0.5)
     drag(recorder, 13.0, key="layout.parameters.pitch_um")
     assert "picture" not in recorder.part_names
     assert "columns" in recorder.part_names
@@ -154,7 +155,7 @@ def test_slow_views_wait_while_dragging(recorder):
 
 @pytest.mark.parametrize("slow", ["sites", "columns"])
 def test_sites_arrive_before_their_values(recorder, slow):
-    costs = recorder.session._costs
+    costs = recorder.session.costs
     for key in ("layout.parameters.pitch_um", None):
         costs.add_part(key, slow, 1.0)
     recorder.do(do="set", key="layout.parameters.pitch_um", value=12.5, final=False)
@@ -242,7 +243,7 @@ def test_rest_releases_unused_memory(settings, make_threaded, monkeypatch):
         released.clear()
 
     # Once in each rest: the thread next wakes up to forget its result.
-    assert session._idle_timeout_s == _session.FORGET_S
+    assert session._idle_work().after_s == _session.FORGET_S
 
 
 @pytest.mark.slow
@@ -263,7 +264,7 @@ def test_complete_result_releases_memory(large, make_threaded, monkeypatch):
 
 def test_closing_stops_the_simulation(settings, make_threaded, monkeypatch):
     is_started = threading.Event()
-    monkeypatch.setattr(Session, "_check", slowly(Session._check, is_started))
+    monkeypatch.setattr(Session, "check", slowly(Session.check, is_started))
     session = make_threaded(settings)
     session.post({"do": "refresh"})
     assert is_started.wait(DEADLINE_S)
@@ -279,7 +280,7 @@ def slowly(check, is_started):
 
     def wait(session, stage):
         is_started.set()
-        wait_until(lambda: session._is_closed)
+        wait_until(lambda: session.queue.is_closed)
         check(session, stage)
 
     return wait
@@ -339,17 +340,17 @@ def test_newer_change_stops_a_simulation(settings, make_threaded, monkeypatch):
 def test_endless_changes_are_not_stopped_forever(recorder, monkeypatch):
     session = recorder.session
     session._can_stop = True
-    session._waiting.append({"do": "set", "key": "seed", "value": 1, "final": True})
+    session.queue.add(SetValue(key="seed", value=1))
     with pytest.raises(SupersededError):
-        session._check("capture")
-    monkeypatch.setattr(_session, "MAX_STOPPED_S", 0.0)
-    session._check("capture")
-    session._waiting.clear()
-    session._check("capture")
+        session.check("capture")
+    monkeypatch.setattr(_queue, "MAX_STOPPED_S", 0.0)
+    session.check("capture")
+    session.queue.waiting.clear()
+    session.check("capture")
 
 
 def test_frames_stop_no_simulation(recorder):
     session = recorder.session
     session._can_stop = True
-    session._waiting.append({"do": "frame", "n": 3})
-    session._check("capture")
+    session.queue.add(ShowFrame(n=3))
+    session.check("capture")

@@ -25,7 +25,7 @@ import foveasim as fs
 from foveasim._io.images import write_picture
 from foveasim.config import build_shot
 from foveasim.studio import _server
-from foveasim.studio._messages import decode_part
+from foveasim.studio._messages.encoding import decode_part
 from foveasim.studio._server import HEADERS, Studio, host_names, other_addresses, serve
 from foveasim.studio._session import Start
 

@@ -23,9 +23,9 @@ from foveasim._io.images import write_picture
 from foveasim.cli import app
 from foveasim.config import build_shot, read_settings
 from foveasim.sensor import PRESETS
-from foveasim.studio import _session, _views
+from foveasim.studio import _queue, _session, _views
 from foveasim.studio._files import start_settings
-from foveasim.studio._messages import decode_part
+from foveasim.studio._messages.encoding import decode_part
 from foveasim.studio._session import Session, Start
 
 LINE = 600
@@ -580,7 +580,7 @@ def test_sites_are_shown_before_slow_parts(recorder, monkeypatch):
     monkeypatch.setattr(_views, "TOGETHER_S", 60.0)
     key = "layout.parameters.pitch_um"
     recorder.do(do="set", key=key, value=13.0, final=True)
-    recorder.session._costs.add_part(key, "picture", 0.5)
+    recorder.session.costs.add_part(key, "picture", 0.5)
     recorder.do(do="set", key=key, value=14.0, final=True)
     groups = groups_of(recorder)
 
@@ -683,17 +683,21 @@ def test_session_without_page_releases_its_results(settings, monkeypatch):
         session.post({"do": "freeze"})
         session.post({"do": "set", "key": "exposure_s", "value": 0.002, "final": True})
         wait_until(lambda: session.history.settings["exposure_s"] == 0.002 and session.result.shot.exposure_s == 0.002)
-        code, frozen_code = session.result.capture.code, session._frozen_result.capture.code
+        code, frozen_code = session.result.capture.code, session.compared.frozen_result.capture.code
         assert not np.array_equal(code, frozen_code)
         session.post({"do": "variant", "action": "keep", "name": "one"})
         wait_until(lambda: list(session.variants))
         session.post({"do": "compare", "variants": [each.id for each in session.variants]})
-        wait_until(lambda: session._compared)
-        results = [session.result, session._frozen_result, *(found for _, found in session._compared.values())]
+        wait_until(lambda: session.compared.results)
+        results = [
+            session.result,
+            session.compared.frozen_result,
+            *(found for _, found in session.compared.results.values()),
+        ]
         captures = [weakref.ref(each.capture) for each in results]
         del results
         # Its thread has nothing more to do.
-        wait_until(lambda: session._idle_timeout_s is None)
+        wait_until(lambda: session._idle_work() is None)
         assert session.result is not None
         session.detach(messages.append)
         wait_until(lambda: session.result is None and all(each() is None for each in captures))
@@ -701,7 +705,7 @@ def test_session_without_page_releases_its_results(settings, monkeypatch):
         session.attach(messages.append)
         wait_until(is_done)
         assert np.array_equal(session.result.capture.code, code)
-        assert np.array_equal(session._frozen_result.capture.code, frozen_code)
+        assert np.array_equal(session.compared.frozen_result.capture.code, frozen_code)
     finally:
         session.close()
 
@@ -728,10 +732,10 @@ def test_signals_are_sent_when_requested(recorder):
 def test_slow_views_wait_for_the_page(settings, monkeypatch):
     """Until the page has drawn the photosites, or a newer message waits."""
     monkeypatch.setattr(_views, "AWAITED_S", -1.0)
-    monkeypatch.setattr(_session, "DRAWN_S", DEADLINE_S)
+    monkeypatch.setattr(_queue, "DRAWN_S", DEADLINE_S)
     session, parts, waits = Session("threaded", Start(settings), n_threads=1), [], threading.Event()
-    wait_for_page = session._views._wait_for_page
-    session._views._wait_for_page = lambda: (waits.set(), wait_for_page())
+    wait_for_page = session.views._wait_for_page
+    session.views._wait_for_page = lambda: (waits.set(), wait_for_page())
 
     def listen(message):
         if isinstance(message, bytes):
@@ -820,7 +824,7 @@ def test_no_setting_leaves_stale_views(make_session, settings):
 
     recorder.do(do="refresh")
     receive()
-    controls = [control for control in recorder.session._controls if other_values(control)]
+    controls = [control for control in recorder.session.controls if other_values(control)]
     for control in controls:
         for value in other_values(control):
             state = recorder.do(do="set", key=control["key"], value=value, final=True)
@@ -830,7 +834,7 @@ def test_no_setting_leaves_stale_views(make_session, settings):
             n_changes += 1
             before = dict(shown)
             for name in set(names) - set(recorder.part_names):  # those sent are of the new state
-                recorder.session._views.forget(name)
+                recorder.session.views.forget(name)
             recorder.do(do="views", names=names)
             receive()
             stale += [(control["key"], name) for name in shown if not is_same(before[name], shown[name])]

@@ -15,6 +15,7 @@ from foveasim import explore
 from foveasim.cli import app
 from foveasim.config import build_shot, put_setting
 from foveasim.explore.sweeps.plan import copy_settings
+from foveasim.studio._messages.models import SetValue, ShowFrame
 from foveasim.studio._session import Session, Start
 
 EXPOSURES = {"key": "exposure_s", "from": 0.001, "to": 0.1, "n": 3, "spacing": "geometric"}
@@ -25,8 +26,8 @@ CODE, RATE = {"measure": "mean_code_dn", "annulus_um": [0, 60]}, {"measure": "da
 def finish(recorder):
     """Compute the points that remain as the thread of a session does; return the last message."""
     session = recorder.session
-    while session._sweeps.is_running:
-        session._sweeps.compute_next(session.engine.simulate)
+    while session.sweeps.is_running:
+        session.sweeps.compute_next(session.engine.simulate)
     return last(recorder)
 
 
@@ -166,7 +167,7 @@ def test_infinite_results_are_not_failures(recorder):
 def test_wrong_sweeps_are_one_line(recorder, message, text):
     recorder.do(**{"do": "sweep", "settings": [EXPOSURES], "results": [CODE], "id": 1, **message})
     assert text in problem(recorder)
-    assert not recorder.session._sweeps.is_running
+    assert not recorder.session.sweeps.is_running
 
 
 # -- interruptions -----------------------------------------------------------------------------------------------------------
@@ -175,18 +176,18 @@ def test_wrong_sweeps_are_one_line(recorder, message, text):
 def test_stopped_sweep_keeps_its_points(recorder):
     recorder.do(do="sweep", settings=[EXPOSURES], results=[CODE], id=1)
     for _ in range(2):
-        recorder.session._sweeps.compute_next(recorder.session.engine.simulate)
+        recorder.session.sweeps.compute_next(recorder.session.engine.simulate)
     recorder.do(do="stop_sweep", id=2)
 
     assert (last(recorder)["state"], len(last(recorder)["points"])) == ("stopped", 1)
-    assert not recorder.session._sweeps.is_running
+    assert not recorder.session.sweeps.is_running
 
 
 def test_later_changes_do_not_affect_a_sweep(recorder, make_session):
     expected = run(make_session(), [EXPOSURES, F_NUMBERS], [CODE])["points"]
     recorder.do(do="sweep", settings=[EXPOSURES, F_NUMBERS], results=[CODE], id=1)
     for k in range(3):
-        recorder.session._sweeps.compute_next(recorder.session.engine.simulate)
+        recorder.session.sweeps.compute_next(recorder.session.engine.simulate)
         state = recorder.do(do="set", key="layout.parameters.n_x", value=8 + k, id=2 + k)
         assert state["settings"]["layout"]["parameters"]["n_x"] == 8 + k
     recorder.do(do="preset", name="shot:foveal", id=9)
@@ -196,7 +197,7 @@ def test_later_changes_do_not_affect_a_sweep(recorder, make_session):
 
 def test_new_sweep_replaces_a_running_one(recorder):
     recorder.do(do="sweep", settings=[EXPOSURES], results=[CODE], id=1)
-    recorder.session._sweeps.compute_next(recorder.session.engine.simulate)
+    recorder.session.sweeps.compute_next(recorder.session.engine.simulate)
     found = run(recorder, [F_NUMBERS], [RATE], number=2)
     assert (found["id"], found["n_points"], len(found["points"])) == (2, 2, 2)
 
@@ -205,13 +206,13 @@ def test_messages_interrupt_a_point(recorder):
     """The point is repeated after the message; frames of a video wait for its end."""
     recorder.do(do="sweep", settings=[F_NUMBERS], results=[CODE], id=1)
     session = recorder.session
-    session._waiting.append({"do": "set", "key": "exposure_s", "value": 0.02})
+    session.queue.add(SetValue(key="exposure_s", value=0.02))
     for _ in range(2):
-        session._sweeps.compute_next(session.engine.simulate)
-    assert session._sweeps.is_running
+        session.sweeps.compute_next(session.engine.simulate)
+    assert session.sweeps.is_running
     session.engine.forget("")
-    session._waiting.clear()
-    session._waiting.append({"do": "frame", "n": 1})
+    session.queue.waiting.clear()
+    session.queue.add(ShowFrame(n=1))
     assert len(finish(recorder)["points"]) == 2
 
 

@@ -113,7 +113,7 @@ def test_equal_names_have_different_files(make_session):
     [
         ({"action": "keep", "name": "  "}, "'name' must have 1 to 80 characters"),
         ({"action": "keep", "name": "x" * 81}, "'name' must have 1 to 80 characters"),
-        ({"action": "keep", "name": "x", "note": 3}, "'note' must have at most 1000 characters"),
+        ({"action": "keep", "name": "x", "note": 3}, "'note' must be a string, got 3"),
         ({"action": "delete", "variant": "../shot"}, "'variant' must be one of the session, got '../shot'"),
         ({"action": "burn"}, "'action' must be keep, update, describe or delete, got 'burn'"),
     ],

@@ -295,8 +295,8 @@ def test_drag_shows_previews_and_then_everything(visit, server, monkeypatch):
     until(page, f"() => {status} && studio.views.parts.columns?.is_preview && studio.state.is_preview")
     # Without further changes the complete result follows.
     monkeypatch.setattr(_session, "PREVIEW_IDLE_S", 0.0)
-    with session._wake:
-        session._wake.notify()
+    with session.queue.wake:
+        session.queue.wake.notify()
     until(page, "() => studio.isIdle && !studio.connection.requests.isPreview && !studio.state.is_preview")
     assert "preview" not in page.inner_text("#status")
     set_value(page, "optics.f_number", 5.6)

@@ -1,4 +1,4 @@
-"""Voronoi cells of points in a region, as packed rings, for the irregular layout generators."""
+"""Voronoi cells of points in a region, as packed rings, for irregular layouts."""
 
 from __future__ import annotations
 

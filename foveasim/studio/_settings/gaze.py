@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,14 +11,16 @@ from foveasim._core.validation import Floats
 from foveasim.config import Shot
 from foveasim.errors import FoveasimError, ParameterError, SimulationError
 from foveasim.fields import PowerMap
+from foveasim.studio._messages.models import AddSaccades, FollowGaze, OpenGazeFile, handles
 from foveasim.video import GazePath, saccades
+
+if TYPE_CHECKING:
+    from foveasim.studio._session import Session
 
 #: Time step of a replay without a frame rate of the readout, s.
 STEP_S = 1.0 / 30.0
 #: Largest number of rows: the settings of the page contain them.
 MAX_ROWS = 10_000
-#: Parameters of random paths that the page sends.
-SACCADES = ("seed", "duration_s", "fixation_s", "drift_um_per_root_s")
 
 
 class SessionGaze:
@@ -57,7 +59,7 @@ class SessionGaze:
             raise SimulationError("there is no gaze path; record or open one")
         return path
 
-    def at(self, settings: Mapping[str, Any], t_s: Any) -> dict[str, Any]:
+    def at(self, settings: Mapping[str, Any], t_s: float) -> dict[str, Any]:
         """Return settings with the gaze of their path at a time."""
         return {**settings, "gaze_um": self.required_path(settings).at(t_s).tolist()}
 
@@ -109,20 +111,19 @@ def rows_of_file(path: str) -> list[list[float]]:
     return _plain(found)
 
 
-def random_rows(message: Mapping[str, Any], shot: Shot | None, frame_s: float | None) -> list[list[float]]:
+def random_rows(parameters: Mapping[str, Any], shot: Shot | None, frame_s: float | None) -> list[list[float]]:
     """
     Return the rows of a random path of saccades for which the image covers the photosites.
 
-    ``message``: parameters of :func:`foveasim.video.saccades`, see :data:`SACCADES`. ``frame_s``: frame period of the video
-    that is the scene; None for pictures. Raises ParameterError or SimulationError when a parameter is invalid, or the image
+    ``parameters``: those of :func:`foveasim.video.saccades`. ``frame_s``: frame period of the video that is the scene; None for
+    pictures. Raises ParameterError or SimulationError when a parameter is invalid, or the image
     does not extend beyond the photosites.
     """
     if shot is None:
         raise SimulationError("there is no image for a gaze path")
-    parameters = {name: message[name] for name in SACCADES if message.get(name) is not None}
     frame_s = frame_s or step_s(shot)
-    duration_s = parameters.get("duration_s")
-    if isinstance(duration_s, int | float) and duration_s > MAX_ROWS * frame_s:
+    duration_s = parameters.get("duration_s", 0.0)
+    if duration_s > MAX_ROWS * frame_s:
         raise ParameterError("duration_s", f"must be at most {MAX_ROWS * frame_s:g} s in the studio", duration_s, "s")
     size_um = (2.0 * free_um(shot)).tolist()
     if not any(size_um):
@@ -145,3 +146,21 @@ def _plain(path: GazePath) -> list[list[float]]:
     """Return the rows of a path as settings contain them."""
     rows: list[list[float]] = path.rows.tolist()
     return rows
+
+
+@handles(FollowGaze)
+def _follow(session: Session, message: FollowGaze) -> dict[str, Any]:
+    return session.gaze.at(session.history.settings, message.t_s)
+
+
+@handles(OpenGazeFile)
+def _open_gaze_file(session: Session, message: OpenGazeFile) -> dict[str, Any]:
+    return {**session.history.settings, "gaze_path": rows_of_file(session.files.available(message.path))}
+
+
+@handles(AddSaccades)
+def _add_saccades(session: Session, message: AddSaccades) -> dict[str, Any]:
+    settings, shot = session.history.settings, None if session.result is None else session.result.shot
+    film = session.frames.about(settings)
+    parameters = message.model_dump(exclude={"id"}, exclude_none=True)
+    return {**settings, "gaze_path": random_rows(parameters, shot, None if film is None else film["frame_s"])}

@@ -7,12 +7,16 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from foveasim.errors import FoveasimError, ParameterError, printable
+from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.layout import LAYOUTS, Layout
+from foveasim.studio._messages.models import MatchBudget, SolveFor, handles
+
+if TYPE_CHECKING:
+    from foveasim.studio._session import Session
 
 #: Key of the parameters of a generator.
 PARAMETERS = "layout.parameters"
@@ -310,3 +314,22 @@ def _label(name: str) -> str:
     for suffix in ("_um", "_deg"):
         name = name.removesuffix(suffix)
     return name.replace("_", " ")
+
+
+@handles(SolveFor)
+def _solve_for(session: Session, message: SolveFor) -> dict[str, Any]:
+    generated = session.layout_source()(session.history.settings)
+    if generated is None:
+        raise SimulationError("there is no layout whose parameters are known")
+    return with_unknown(session.history.settings, message.name, generated)
+
+
+@handles(MatchBudget)
+def _match_budget(session: Session, _message: MatchBudget) -> dict[str, Any]:
+    settings, frozen = session.history.settings, session.compared.frozen_result
+    if frozen is None or session.result is None:
+        raise SimulationError("there is no variant A to compare with")
+    n_sites, edited = frozen.capture.layout.n_sites, session.result.capture.layout
+    own = session.layout_source()(settings) or edited
+    # Edits may change the number of the generator.
+    return with_n_sites(settings, max(1, round(n_sites * own.n_sites / edited.n_sites)), own)

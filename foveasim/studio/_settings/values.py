@@ -4,40 +4,25 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from foveasim.config import get_setting, put_setting
 from foveasim.errors import ParameterError, printable
 from foveasim.layout import Layout
 from foveasim.studio._engine import Simulated
 from foveasim.studio._files import apply_preset
-from foveasim.studio._messages import from_json
-from foveasim.studio._settings.changes import check_depth, choose_preset, key_of
+from foveasim.studio._messages.models import AssignValues, SetValue, handles
+from foveasim.studio._settings.changes import choose_preset
 from foveasim.studio._settings.controls import chosen_value
 from foveasim.studio._settings.unknowns import balanced, solved_of
+
+if TYPE_CHECKING:
+    from foveasim.studio._session import Session
 
 #: Kinds of controls of numbers.
 NUMBERS = ("number", "integer")
 #: Setting that may also be a string, such as "auto".
 EXPOSURE = "exposure_s"
-#: Largest number of values that are set at once.
-MAX_VALUES = 100
-
-
-def values_of(message: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """
-    Return the keys and values of a message that sets several.
-
-    Raises ParameterError when they are not a list of mappings with a key and a value.
-    """
-    values = message.get("values")
-    if (
-        not isinstance(values, list)
-        or not 0 < len(values) <= MAX_VALUES
-        or not all(isinstance(v, dict) for v in values)
-    ):
-        raise ParameterError("values", f"must be a list of 1 to {MAX_VALUES} mappings with a key and a value")
-    return [(key_of(each), from_json(check_depth(each.get("value")))) for each in values]
 
 
 def with_values(
@@ -59,7 +44,7 @@ def with_values(
         if key == "layout" and isinstance(value, str):
             settings = apply_preset(f"layout:{value}", settings)
         else:
-            put_setting(None, settings, key, chosen_value(key, value, controls, settings, start))
+            put_setting(None, settings, key, chosen_value(key, copy.deepcopy(value), controls, settings, start))
         settings = balanced(settings, key, before, layout_of)
         if key == "sensor.preset":
             choose_preset(settings)
@@ -85,3 +70,13 @@ def present_number(settings: Mapping[str, Any], control: Mapping[str, Any], resu
     if key == EXPOSURE and not isinstance(present, int | float):
         return result.shot.exposure_s
     return solved_of(settings, result.capture.layout).get(key, control["default"]) if present is None else present
+
+
+@handles(SetValue)
+def _set(session: Session, message: SetValue) -> dict[str, Any]:
+    return session.setter()(session.history.settings, [(message.key, message.value)])
+
+
+@handles(AssignValues)
+def _assign(session: Session, message: AssignValues) -> dict[str, Any]:
+    return session.setter()(session.history.settings, [(each.key, each.value) for each in message.values])

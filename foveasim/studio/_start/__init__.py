@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from foveasim.studio._start.contents import contents_of
-from foveasim.studio._start.new_sensor import new_sensor
 from foveasim.studio._start.recent import recent_files
 
-__all__ = ["contents_of", "new_sensor", "recent_files"]
+__all__ = ["contents_of", "recent_files"]

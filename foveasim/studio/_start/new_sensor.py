@@ -5,20 +5,22 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from foveasim._core.validation import check_choice, check_count, check_length_um
+from foveasim._core.validation import check_choice, check_length_um
 from foveasim.config import build_shot
-from foveasim.errors import ParameterError
 from foveasim.layout import LAYOUTS, MOSAICS, Layout
 from foveasim.sensor import PRESETS
-from foveasim.studio._engine import MAX_SITES
 from foveasim.studio._files import with_covering_scene, with_layout
+from foveasim.studio._messages.models import NewSensor, handles
 from foveasim.studio._settings.changes import choose_preset, match_filters
 from foveasim.studio._settings.templates import templates
 from foveasim.studio._settings.unknowns import INSTEAD_OF, generated_layout, with_n_sites
+
+if TYPE_CHECKING:
+    from foveasim.studio._session import Session
 
 #: Generators that fill a rectangle, with the parameters that its sides and the number of photosites replace.
 RECTANGULAR: dict[str, tuple[str, ...]] = {
@@ -62,37 +64,28 @@ def electronics() -> list[str]:
     return [name for name, preset in PRESETS.items() if set(preset.settings()) >= RANGE]
 
 
-def new_sensor(settings: Mapping[str, Any], template: Mapping[str, Any]) -> dict[str, Any]:
+@handles(NewSensor)
+def new_sensor(session: Session, message: NewSensor) -> dict[str, Any]:
     """
     Return settings with a new sensor, which the scene covers; its exposure is automatic.
 
-    Optics, scene and seed remain. The centre of the sensor is at that of the image.
-
-    Parameters
-    ----------
-    settings : mapping
-    template : mapping
-        ``generator``; ``size_um`` (width, height) of the format, which rasters fill, and in whose shorter side other layouts
-        are inscribed; ``n_sites``, approximately; ``filters``, a name of :func:`mosaics` or None; ``electronics``, a name of
-        :func:`electronics`.
-
-    Raises
-    ------
-    ParameterError
-        When a value is invalid, or the generator cannot have this number of photosites.
-    SimulationError
-        When the scene has a size that cannot change.
+    Optics, scene and seed remain. The centre of the sensor is at that of the image. Raises ParameterError when a name is
+    unknown, or the generator cannot have this number of photosites. Raises SimulationError when the scene has a size that
+    cannot change.
     """
-    generator = check_choice("generator", template.get("generator"), generators())
-    mosaic = template.get("filters")
+    settings = session.history.settings
+    session.check("solving for the number of photosites")
+    generator = check_choice("generator", message.generator, generators())
+    mosaic = message.filters
     if mosaic is not None:
         check_choice("filters", mosaic, mosaics())
-    found = with_layout(settings, _layout(generator, _size_um(template), _n_sites(template), settings))
+    size_um = [check_length_um("size_um", length_um) for length_um in message.size_um]
+    found = with_layout(settings, _layout(generator, size_um, message.n_sites, settings))
     found.pop("gaze_um", None)
     found["scene"].pop("gaze_range_um", None)
     found["sensor"] = {
         **(found.get("sensor") or {}),
-        "preset": check_choice("electronics", template.get("electronics"), electronics()),
+        "preset": check_choice("electronics", message.electronics, electronics()),
     }
     choose_preset(found)
     found["sensor"].pop("filters", None)
@@ -105,19 +98,7 @@ def new_sensor(settings: Mapping[str, Any], template: Mapping[str, Any]) -> dict
     return found
 
 
-def _size_um(template: Mapping[str, Any]) -> tuple[float, float]:
-    size_um = template.get("size_um")
-    if not isinstance(size_um, Sequence) or isinstance(size_um, str) or len(size_um) != 2:
-        raise ParameterError("size_um", "must be the width and the height of the sensor")
-    width_um, height_um = (check_length_um("size_um", length_um) for length_um in size_um)
-    return width_um, height_um
-
-
-def _n_sites(template: Mapping[str, Any]) -> int:
-    return check_count("n_sites", template.get("n_sites"), at_most=MAX_SITES)
-
-
-def _layout(generator: str, size_um: tuple[float, float], n_sites: int, settings: Mapping[str, Any]) -> dict[str, Any]:
+def _layout(generator: str, size_um: Sequence[float], n_sites: int, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the section of a layout in a format, with the design rules that it satisfies."""
     if generator in RECTANGULAR:
         given = templates(f"{generator} parameters")

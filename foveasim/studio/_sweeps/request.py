@@ -12,14 +12,11 @@ from foveasim.config import RegionResult, validate
 from foveasim.errors import ParameterError
 from foveasim.explore.sweeps.plan import SEED, ValueRange
 from foveasim.metrics import metric_info
-from foveasim.studio._messages import from_json
-from foveasim.studio._settings.changes import check_depth, key_of
+from foveasim.studio._messages.models import SweptSetting
 from foveasim.studio._settings.values import number_control
 
 #: Largest number of points: a page shows the results of each, and a table of all.
 MAX_POINTS = 1000
-#: Largest number of settings, and of results.
-MAX_AXES, MAX_RESULTS = 2, 2
 #: Significant digits of values between the ends.
 DIGITS = 6
 
@@ -50,31 +47,27 @@ class Axis:
         }
 
 
-def axes_of(message: Mapping[str, Any], controls: Sequence[Mapping[str, Any]]) -> list[Axis]:
+def axes_of(settings: Sequence[SweptSetting], controls: Sequence[Mapping[str, Any]]) -> list[Axis]:
     """
     Return the settings of a sweep with their values.
 
     Raises ParameterError or ConfigError when a setting is not a number, its range is invalid, or there are too many points.
     """
-    ranges = _mappings(message, "settings", MAX_AXES)
-    keys = [key_of(each) for each in ranges]
+    keys = [each.key for each in settings]
     if len(set(keys)) < len(keys):
         raise ParameterError("settings", "must differ", keys[0])
     if SEED in keys:
         raise ParameterError("settings", "must not contain the seed: all points of a sweep have the same one")
-    found = [
-        (number_control(controls, key), _range_of({name: item for name, item in each.items() if name != "key"}))
-        for key, each in zip(keys, ranges, strict=True)
-    ]
+    found = [(number_control(controls, each.key), _range_of(each.model_extra or {})) for each in settings]
     n_points = math.prod(value_range.n for _, value_range in found)
     if n_points > MAX_POINTS:
         raise ParameterError("n", f"must give at most {MAX_POINTS:,} points, got {n_points:,}; use fewer values")
     return [Axis(control, _values(control, each), each.spacing == "geometric") for control, each in found]
 
 
-def results_of(message: Mapping[str, Any]) -> list[RegionResult]:
+def results_of(given: Sequence[Mapping[str, Any]]) -> list[RegionResult]:
     """Return the results of a sweep; raise an error when one is invalid."""
-    found = [validate(None, RegionResult, each) for each in _mappings(message, "results", MAX_RESULTS)]
+    found = [validate(None, RegionResult, each) for each in given]
     if found.count(found[0]) > 1:
         raise ParameterError("results", "must differ", found[0].subject)
     return found
@@ -88,13 +81,6 @@ def about_result(result: RegionResult) -> dict[str, Any]:
         "subject": result.subject,
         "unit": result.unit,
     }
-
-
-def _mappings(message: Mapping[str, Any], name: str, n_most: int) -> list[dict[str, Any]]:
-    found = from_json(check_depth(message.get(name)))
-    if not isinstance(found, list) or not 0 < len(found) <= n_most or not all(isinstance(each, dict) for each in found):
-        raise ParameterError(name, f"must be a list of 1 to {n_most} mappings")
-    return found
 
 
 def _range_of(data: Mapping[str, Any]) -> ValueRange:

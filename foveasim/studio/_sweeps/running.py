@@ -6,25 +6,27 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from foveasim.config import RegionResult
+from foveasim.config import RegionResult, check_settings
 from foveasim.errors import SimulationError
 from foveasim.explore import result_of
 from foveasim.studio._costs import SupersededError
 from foveasim.studio._engine import Simulated
-from foveasim.studio._settings.changes import is_frame
+from foveasim.studio._messages.models import Message, SendSweepFile, StartSweep, StopSweep, handles
+from foveasim.studio._settings.values import present_number
 from foveasim.studio._sweeps.files import sweep_file
-from foveasim.studio._sweeps.request import Axis, about_result
+from foveasim.studio._sweeps.request import Axis, about_result, axes_of, results_of
+
+if TYPE_CHECKING:
+    from foveasim.studio._session import Session
 
 #: Shortest time between two messages with partial results.
 SEND_S = 0.1
 #: Messages interrupt a point for at most this time in succession, so that sweeps advance while a slider is dragged.
 MAX_STOPPED_S = 3.0
-#: Messages that replace or end a sweep: they interrupt a point at any time.
-CONTROLS = ("sweep", "stop_sweep")
 
 
 class Sweep:
@@ -181,10 +183,10 @@ class Sweeps:
         if not self.is_running or time.monotonic() - self._sent_s >= SEND_S:
             self.send()
 
-    def is_interrupted(self, waiting: Iterable[Any]) -> bool:
+    def is_interrupted(self, waiting: Iterable[Message]) -> bool:
         """Return whether messages that wait interrupt the present point; frames of a video do not."""
-        others = [message for message in waiting if not is_frame(message)]
-        if any(isinstance(message, Mapping) and message.get("do") in CONTROLS for message in others):
+        others = [message for message in waiting if not message.is_frame]
+        if any(message.ends_points for message in others):
             return True
         stopped_s = None if self._sweep is None else self._sweep.stopped_s
         return bool(others) and (stopped_s is None or time.monotonic() - stopped_s < MAX_STOPPED_S)
@@ -198,3 +200,31 @@ class Sweeps:
         if self._sweep is None:
             raise SimulationError("there is no sweep; run one first")
         return self._sweep.file(directories)
+
+
+@handles(StartSweep)
+def _start(session: Session, message: StartSweep) -> None:
+    result, base, set_values = (
+        session.required_result("start from"),
+        session.frames.with_file(session.history.settings),
+        session.setter(),
+    )
+    axes = axes_of(message.settings, session.controls)
+    present = [present_number(base, axis.control, result) for axis in axes]
+
+    def change(settings: dict[str, Any], values: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+        found: dict[str, Any] = session.files.resolve(set_values(settings, values))
+        check_settings(None, found)
+        return found
+
+    session.sweeps.start(Sweep(message.id, base, axes, results_of(message.results), present, change))
+
+
+@handles(StopSweep)
+def _stop(session: Session, _message: StopSweep) -> None:
+    session.sweeps.stop()
+
+
+@handles(SendSweepFile)
+def _send_file(session: Session, message: SendSweepFile) -> None:
+    session.send_text(message.id, "sweep", *session.sweeps.file(session.file_directories))

@@ -99,12 +99,14 @@ def to_json(value: Any) -> Any:
     return value
 
 
-def from_json(value: Any) -> Any:
-    """Return plain data with infinity for ``".inf"``."""
+def from_json(value: Any, n_levels: int = 1000) -> Any:
+    """Return plain data with infinity for ``".inf"``; raise ValueError for more levels."""
+    if n_levels < 0:
+        raise ValueError(n_levels)
     if isinstance(value, dict):
-        return {name: from_json(item) for name, item in value.items()}
+        return {name: from_json(item, n_levels - 1) for name, item in value.items()}
     if isinstance(value, list):
-        return [from_json(item) for item in value]
+        return [from_json(item, n_levels - 1) for item in value]
     return NOT_FINITE.get(value, value) if isinstance(value, str) else value
 
 
