@@ -22,7 +22,7 @@ from foveasim._core.validation import Floats, Ints, check_count, frozen_array, r
 from foveasim._io.atomic import atomic_directory
 from foveasim._io.npz import open_archive, write_archive
 from foveasim._io.zarr_stores import ZARR, Variable, free_name, open_store, store_format, write_variables
-from foveasim.columns import COLUMNS, STORED, column_info, compute_column
+from foveasim.columns import COLUMNS, STORED, column_info, compute_column, find_column
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout.model import Layout
@@ -162,8 +162,8 @@ class Capture:
         Parameters
         ----------
         name : str
-            An array of the capture, a column of the layout, or a column in :data:`foveasim.columns.COLUMNS`, such as
-            ``"snr"``.
+            An array of the capture, a column of the layout, ``"area_um2"``, ``"size_um"``, ``"channel"``, ``"readout_line"``,
+            or a column in :data:`foveasim.columns.COLUMNS`, such as ``"snr"``.
         sensor : Sensor, optional
             As for :meth:`picture`.
 
@@ -189,12 +189,7 @@ class Capture:
         ((256,), dtype('float64'))
         """
         self._check_sensor(sensor)
-        if name not in STORED and name in self.layout.columns:
-            return self.layout.columns[name]
-        if name not in COLUMNS:
-            known = sorted({*COLUMNS, *self.layout.columns})
-            raise ParameterError("name", "must be the name of a column", name, hint=possible_names(name, known))
-        return compute_column(name, self, sensor)
+        return find_column("name", name, self.layout, self, sensor)[0]
 
     @property
     def saturated_fraction(self) -> float:

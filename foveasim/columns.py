@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.calls import publish
+from foveasim._core.names import possible_names
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, words_and_unit
-from foveasim.errors import SimulationError
+from foveasim.errors import ParameterError, SimulationError
+from foveasim.layout.model import Layout
 
 if TYPE_CHECKING:
     from foveasim.capture import Capture
@@ -32,6 +34,8 @@ __all__ = ["COLUMNS", "Column", "ColumnInfo", "column_info"]
 Column: TypeAlias = Callable[..., NDArray[Any]]
 #: The column that figures and pages show first.
 MAIN = "code"
+#: Columns that every layout has.
+OF_LAYOUT = ("channel", "area_um2", "size_um", "readout_line")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +111,26 @@ def column_info(name: str) -> ColumnInfo:
     found: ColumnInfo = COLUMNS.info(name) or ColumnInfo()
     words, unit = words_and_unit(name)
     return replace(found, title=found.title or words, unit=found.unit if found.unit or found.title else unit)
+
+
+def find_column(
+    parameter: str, name: str, layout: Layout, capture: Capture | None = None, sensor: Sensor | None = None
+) -> tuple[NDArray[Any], ColumnInfo]:
+    """
+    Return a column of a layout, or of a capture of it, (n_site,), and the facts about it.
+
+    Arrays of the capture come first, then columns of the layout. Raises ParameterError for the parameter when neither has the
+    column, and errors as :func:`compute_column`.
+    """
+    if capture is not None and name in COLUMNS and (name in STORED or name not in layout.columns):
+        return compute_column(name, capture, sensor), column_info(name)
+    if name in layout.columns or name in OF_LAYOUT:
+        words, unit = words_and_unit(name)
+        return layout.columns[name] if name in layout.columns else getattr(layout, name), ColumnInfo(
+            title=words, unit=unit
+        )
+    known = {*(COLUMNS if capture is not None else ()), *OF_LAYOUT, *layout.columns}
+    raise ParameterError(parameter, "must be the name of a column", name, hint=possible_names(name, sorted(known)))
 
 
 def compute_column(name: str, capture: Capture, sensor: Sensor | None = None) -> NDArray[Any]:

@@ -96,6 +96,7 @@ def test_columns_are_the_arrays_of_captures(capture):
     for name in ("code", "electrons", "expected_e", "filter_of_site"):
         np.testing.assert_array_equal(capture.column(name), getattr(capture, name))
     np.testing.assert_array_equal(capture.column("snr"), capture.signal_to_noise())
+    np.testing.assert_array_equal(capture.column("area_um2"), np.full(30, 16.0))
     mean_dn, _ = capture.electronics.predict(capture.expected_e, exposure_s=0.01)
     np.testing.assert_array_equal(capture.column("expected_dn"), mean_dn)
 

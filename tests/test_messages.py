@@ -216,7 +216,7 @@ WRONG = {
     ),
     "column of a plot": (
         lambda: GRID.plot("aera_um2"),
-        "'by' must be a column or an array, got 'aera_um2'; did you mean 'area_um2'? possible: 'area_um2', 'channel', ",
+        "'by' must be the name of a column, got 'aera_um2'; did you mean 'area_um2'? possible: 'area_um2', 'channel', ",
     ),
     "column of a layout": (
         lambda: GRID.sort_by("rwo"),

@@ -9,11 +9,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.names import possible_names
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, Ints, as_numbers, finite_array, frozen_array, unmasked, words_and_unit
 from foveasim.capture import Capture
-from foveasim.columns import COLUMNS, MAIN, STORED, column_info
+from foveasim.columns import MAIN, find_column
 from foveasim.errors import ParameterError, type_name
 from foveasim.layout import Layout
 from foveasim.reconstruct.picture import NO_DATA_COLOUR
@@ -67,8 +66,6 @@ GREY, VIRIDIS = "gray", "viridis"
 DISPLAY_GAMMA = 1.0 / 2.2
 #: Integers with more distinct values are shown on a scale, and strings without a legend.
 MAX_CATEGORIES = 10
-#: Columns that every layout has.
-OF_LAYOUT = ("channel", "area_um2", "size_um", "readout_line")
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,26 +231,12 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
     if by == "channel" or (by == "filter_of_site" and capture is not None):
         names = _channel_names(layout) if capture is None else capture.filter_names
         return _filters(layout.channel if capture is None else capture.filter_of_site, names, label or "filter")
-    values, title = _column(data, by)
-    title = label or title
-    if capture is not None and by in COLUMNS and column_info(by).is_signal:
+    values, info = find_column("by", by, layout, capture)
+    title = label or info.heading
+    if capture is not None and info.is_signal:
         return _signal_colours(capture, np.asarray(values, np.float64), title)
     is_categorical = by == "readout_line" or _is_categorical(values)
     return _categories(values, title) if is_categorical else _continuous(values.astype(np.float64), title, VIRIDIS)
-
-
-def _column(data: Layout | Capture, by: str) -> tuple[NDArray[Any], str]:
-    """Return the values of a column, and its title with the unit."""
-    layout = data.layout if isinstance(data, Capture) else data
-    if isinstance(data, Capture) and by in COLUMNS and (by in STORED or by not in layout.columns):
-        return data.column(by), column_info(by).heading
-    if by in layout.columns:
-        return layout.columns[by], title_of(by)
-    if by in OF_LAYOUT:
-        values: NDArray[Any] = getattr(layout, by)
-        return values, title_of(by)
-    known = {*(COLUMNS if isinstance(data, Capture) else ()), *OF_LAYOUT, *layout.columns}
-    raise ParameterError("by", "must be a column or an array", by, hint=possible_names(by, sorted(known)))
 
 
 def title_of(name: str) -> str:

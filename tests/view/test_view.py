@@ -427,7 +427,7 @@ def test_oversized_drawing_raises_without_output(tmp_path):
         ({"by": np.full((2, 3), np.nan)}, "'by' must be finite everywhere"),
         (
             {"by": "code"},
-            "'by' must be a column or an array, got 'code'; possible: 'area_um2', 'channel', 'readout_line', 'size_um'",
+            "'by' must be the name of a column, got 'code'; possible: 'area_um2', 'channel', 'readout_line', 'size_um'",
         ),
         ({"overlay": "lines"}, "'overlay' must be one of 'readout_lines', 'adjacency'"),
         ({"overlay": "readout_lines"}, "'readout_line' must be a column of the layout"),

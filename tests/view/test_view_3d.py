@@ -233,7 +233,7 @@ def test_prism_height_and_colour_columns():
         ({"height": -np.ones(5)}, "'height' must be >= 0"),
         ({"height": np.array([1, 2, 3, 4, np.nan])}, "'height' must be finite"),
         ({"height": "name"}, "'height' must be an array of numbers"),
-        ({"height": "no such column"}, "'height' must be a column or an array"),
+        ({"height": "no such column"}, "'height' must be the name of a column"),
         ({"height": np.ones((5, 3))}, "'height' must have 1 dimension"),
         ({"max_height_um": 0.0}, "'max_height_um' must be > 0"),
     ],
