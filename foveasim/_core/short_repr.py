@@ -10,7 +10,7 @@ import numpy as np
 
 from foveasim.errors import format_value
 
-#: Characters of a representation, and of the value of a field.
+#: Largest number of characters of a representation, and of the value of one field.
 MAX_REPR, MAX_FIELD = 200, 60
 #: Largest number of elements of an array that is written as a list.
 MAX_LISTED = 3
@@ -36,8 +36,8 @@ def short_repr(item: Any) -> str:
     """
     if is_dataclass(item):
         shown = {f.name: getattr(item, f.name) for f in fields(item) if f.repr and not f.name.startswith("_")}
-        optional = {f.name for f in fields(item) if f.name in shown and _is_default(f, shown[f.name])}
-        values = {name: value for name, value in shown.items() if name not in optional}
+        at_default = {f.name for f in fields(item) if f.name in shown and _is_default(f, shown[f.name])}
+        values = {name: value for name, value in shown.items() if name not in at_default}
     else:
         values = item._asdict()  # a named tuple
     text = f"{type(item).__name__}("
@@ -81,7 +81,7 @@ def format_field(value: Any) -> str:
 
 
 def _is_default(field: Field[Any], value: Any) -> bool:
-    """Return whether a field has the value of its default."""
+    """Return whether a value is the default of its field; empty collections equal None."""
     default = field.default if field.default_factory is MISSING else field.default_factory()
     if default is None and isinstance(value, list | tuple | Mapping):
         return not value

@@ -20,9 +20,9 @@ from foveasim._core.validation import check_count
 
 #: Smallest size of the thread pool: users may request more threads than there are cores.
 MIN_POOL_THREADS = 8
-#: Upper limit, above the number of cores of any machine.
+#: Largest number of threads that can be requested, above the number of cores of any machine.
 MAX_THREADS = 4096
-#: Option of mallopt for the number of heaps, the smallest number, and threads for each further one.
+#: Option of mallopt that limits the number of heaps; the smallest limit; number of threads that share one heap.
 M_ARENA_MAX, MIN_HEAPS, THREADS_PER_HEAP = -8, 2, 4
 
 _Item = TypeVar("_Item")
@@ -33,8 +33,8 @@ class cached_property(functools.cached_property[_Result]):  # noqa: N801 -- repl
     """
     Cached property without a lock.
 
-    Threads that compute it at the same time receive the same object. That of Python 3.11 has one lock for all instances of a
-    class: a process that is forked while a thread holds it could never compute the property.
+    Threads that compute it at the same time receive the same object. ``functools.cached_property`` of Python 3.11 has one lock
+    for all instances of a class: a process that is forked while a thread holds the lock could never compute the property.
     """
 
     def __get__(self, instance: object, owner: type | None = None) -> Any:
@@ -61,7 +61,7 @@ class ForkSafeLock:
         self._lock.release()
 
     def renew(self) -> None:
-        """Replace the lock if a thread holds it that this process does not have."""
+        """Replace the lock unless this thread holds it: threads of the parent never release it."""
         if not self._lock._is_owned():  # type: ignore[attr-defined]  # noqa: SLF001 -- as Condition of the standard library
             self._lock = RLock()
 
@@ -74,13 +74,13 @@ def _renew_locks() -> None:
         lock.renew()
 
 
-#: Number of threads where none is given, in the context of a caller that has its own number.
+#: Number of threads of calls that do not specify one, set by :func:`default_threads`; None: all available cores.
 _default: ContextVar[int | None] = ContextVar("default_threads", default=None)
 
 
 @contextmanager
 def default_threads(n_threads: int) -> Iterator[None]:
-    """Use a number of threads in all calls of the block that are given none."""
+    """Set the number of threads of all calls in the block that do not specify one."""
     token = _default.set(n_threads)
     try:
         yield
@@ -146,10 +146,10 @@ def parallel_map(work: Callable[[_Item], _Result], items: Iterable[_Item], n_thr
 
 def _limit_heaps() -> None:
     """
-    Limit the number of heaps (arenas) of the C library of GNU, unless the environment does.
+    Limit the number of heaps (arenas) of glibc, unless environment variables set it.
 
-    By default each thread has its own one, and retains parts of pages between used blocks. After 300 captures of different
-    cameras and pictures with two cores, a process had 1031 MB with the default, and 806 MB with two heaps.
+    By default each thread has its own heap, which keeps freed memory between blocks in use. After 300 captures of different
+    cameras and pictures on two cores, a process occupied 1031 MB with the default, and 806 MB with two heaps.
     """
     if sys.platform.startswith("linux") and not {"MALLOC_ARENA_MAX", "GLIBC_TUNABLES"} & os.environ.keys():
         with suppress(AttributeError, OSError):  # other C libraries

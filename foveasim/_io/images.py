@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 #: Larger pictures are rejected: 2**28 pixels are 3 GiB as three float32 channels.
 MAX_PIXELS = 2**28
-#: Limits of decompressed EXR data: for small files, and per byte of larger ones, the maximum ratio of deflate.
+#: Limit of decompressed EXR data: a constant, plus the maximum compression ratio of deflate per byte of the file.
 MIN_DECOMPRESSED_BYTES, MAX_DECOMPRESSION_RATIO = 2**28, 1032
 #: Formats that are read with Pillow; its other formats are not photographs.
 PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "TGA")

@@ -106,7 +106,11 @@ codecs.register_error(HANDLER, _replace_unencodable)
 
 
 def with_progress(items: Iterable[T], what: str, n_items: int | None, n_before: int = 0) -> Iterator[T]:
-    """Yield items with a progress bar; the remaining time is estimated from new items only."""
+    """
+    Yield items with a progress bar.
+
+    ``n_before``: items that were done earlier; the remaining time is estimated without them.
+    """
     from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
 
     console = PlainConsole()

@@ -17,7 +17,8 @@ def read_text(path: Path, what: str, max_bytes: int) -> str:
     """
     Read a UTF-8 text file, with or without a byte order mark.
 
-    Raises FileError when the file is missing, larger than ``max_bytes``, or not UTF-8 text; ``what``: what it must be.
+    ``what``: expected content, for the message. Raises FileError when the file is missing, larger than ``max_bytes``, or not
+    UTF-8 text.
     """
     try:
         if not path.is_file():
@@ -35,7 +36,7 @@ def read_text(path: Path, what: str, max_bytes: int) -> str:
 
 def read_columns(path: Path, what: str, names: Sequence[str], max_bytes: int) -> list[tuple[int, list[str]]]:
     """
-    Read columns of a CSV file, which its first line names, in any order.
+    Read columns of a CSV file by the names in its first line.
 
     Returns the number of each line with its cells in the order of ``names``; empty lines and other columns are ignored.
     ``what``, ``max_bytes``: as for :func:`read_text`. Raises FileError when the file cannot be read, or a column or a cell is

@@ -20,7 +20,7 @@ N_RGB = 3
 MIN_WHITE_FRACTION = 0.01
 #: Filters whose responses to the patches have smaller singular values, relative to the largest, do not distinguish colours.
 MIN_SINGULAR_VALUE = 1e-3
-#: Weight of patches of at least this luminance, relative to white, decreases as the slope of CIELAB.
+#: Patches are weighted by the slope of CIELAB at their luminance; darker patches than this, relative to white, as at this one.
 MIN_LUMINANCE = 0.01
 #: Matrices and colour differences are rounded, so that they are equal on all machines.
 MATRIX_DECIMALS, DIFFERENCE_DECIMALS = 9, 3
@@ -48,12 +48,13 @@ def colour_correction(sensor: Sensor, light: Scene | PowerMap) -> ColourCorrecti
     """
     Return the colour correction of a sensor's filters for a scene.
 
-    For photographs in red, green and blue, the matrix is the inverse of what the filters do to their primaries: noiseless
+    For photographs in red, green and blue, the matrix inverts the responses of the filters to the three primaries: noiseless
     values return the photograph. For other scenes it is the least-squares solution for the 24 patches of the colour chart
     under the illuminant of the scene, adapted to D65, with the weights of CIELAB, that preserves white (Finlayson and Drew,
     White-point preserving color correction, 5th Color Imaging Conference, 1997).
 
-    None if the filters cannot distinguish colours: fewer than three with photosites, or bands of light, or equal ones.
+    Returns None if the filters cannot distinguish colours: fewer than three filters have photosites, the light has fewer than
+    three bands, or the responses of filters are too similar.
     """
     n_filters, waves_nm = len(sensor.filter_names), light.wavelength_nm
     if min(n_filters, waves_nm.size) < N_RGB:

@@ -11,7 +11,7 @@ from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET
 
 #: Exposure time in seconds, or as :func:`exposure_time` reads it.
 ExposureTime: TypeAlias = float | str
-#: What settings record of an automatic exposure.
+#: Entry in the settings of captures with automatic exposure.
 AUTO_SETTINGS = {"auto_exposure": {"target": AUTO_TARGET, "percentile": AUTO_PERCENTILE}}
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _FRACTION = re.compile(rf"({_NUMBER})(?:\s*/\s*({_NUMBER}))?")

@@ -39,10 +39,10 @@ def axis_of(bounds_um: Floats) -> Position:
 
 
 def different_part(one: Camera, other: Camera) -> str:
-    """Return in what two cameras differ, ``"optics"`` or ``"distortion"``; empty for nothing."""
+    """Return the part in which two cameras differ: ``"optics"``, ``"distortion"`` or ``""``."""
     for part in ("optics", "distortion"):
-        own, others = getattr(one, part), getattr(other, part)
-        if own is not others and to_plain_data(own) != to_plain_data(others):
+        part_of_one, part_of_other = getattr(one, part), getattr(other, part)
+        if part_of_one is not part_of_other and to_plain_data(part_of_one) != to_plain_data(part_of_other):
             return part
     return ""
 
@@ -67,17 +67,17 @@ def common_bounds_um(cameras: Sequence[Camera], fit: str) -> Floats:
 
 def fit_scene(scene: Scene, optics: Optics, lens: Lens | None, bounds_um: Floats) -> Scene:
     """
-    Return a scene with the pitch and the optical axis of its framing on a field.
+    Return a scene with the pitch and the optical axis that fit it to a field.
 
-    ``bounds_um``: of the field, (4,). See :meth:`foveasim.Camera.fit_scene`.
+    ``bounds_um``: bounds of the field, (4,). See :meth:`foveasim.Camera.fit_scene`.
     """
     fit, frame = scene.fit, SensorFrame.of(lens, axis_of(bounds_um))
     axis_um, range_um = np.array(frame.axis_um), np.array(scene.gaze_range_um)
     below_um, above_um = axis_um - bounds_um[:2] + range_um, bounds_um[2:] - axis_um + range_um
-    # The image scales with the pitch. At this one its pixels are of about 1 µm.
+    # The size of the image is proportional to the pitch. With this pitch, the pixels of the image are about 1 µm wide.
     unit_um = 1.0 / optics.magnification(scene.distance_m)
-    one = scene.framed(unit_um, frame.axis_um)
-    images = [optics.grid(one)] if fit == "width" else [grid for grid, _ in optics.image_grids(one)]
+    trial = scene.framed(unit_um, frame.axis_um)
+    images = [optics.grid(trial)] if fit == "width" else [grid for grid, _ in optics.image_grids(trial)]
     half_um = 0.5 * np.array([size_um(frame.image(grid).bounds_um) for grid in images])
     if fit == "width":
         scale = 0.5 * (below_um + above_um)[0] / half_um[0, 0]

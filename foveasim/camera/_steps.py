@@ -35,10 +35,10 @@ NEGATIVE_ROUNDING = 1e-4
 
 class WeightedMap(NamedTuple):
     """
-    A power map, and the index of its grid.
+    A power map, and the sites to which it contributes.
 
-    ``where`` are the sites that it contributes to, (n_site,), None for all; ``weight`` is a factor on their powers, (n_site,),
-    None for 1.
+    ``image``: index of the integrator for the grid of the map. ``where`` (n_site,): sites to which the map contributes, None
+    for all. ``weight`` (n_site,): factor of their powers, None for 1.
     """
 
     image: int
@@ -59,7 +59,7 @@ class SensorFrame(NamedTuple):
 
     @classmethod
     def of(cls, lens: Lens | None, axis_um: tuple[float, float] = (0.0, 0.0)) -> SensorFrame:
-        """Return the frame of a lens model, or that with an axis and equal scales without one."""
+        """Return the frame of a lens model; without a model, use ``axis_um`` and equal scales."""
         if lens is None:
             return cls(axis_um, np.ones(2))
         focal_um = np.broadcast_to(np.asarray(lens.focal_um), (2,))

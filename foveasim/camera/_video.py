@@ -26,7 +26,7 @@ from foveasim.sensor.limits import EXPOSURE
 if TYPE_CHECKING:
     from foveasim.camera._camera import Camera
 
-#: Exposures that exceed the time between them by this fraction do so by rounding.
+#: Relative excess of an exposure over the time between exposures that counts as rounding.
 TIME_ROUNDING = 1e-9
 
 
@@ -73,10 +73,12 @@ def _separate(
     """Yield one capture per frame, each exposed to this frame alone."""
     clock = Clock()
     for k, (task, rate_e_per_s) in enumerate(rates_of_frames(camera, frames, clock, ahead)):
-        number = Streams(streams.seed, streams.frame + k)
-        exposure_s = times_s[number.frame % len(times_s)]
+        frame_streams = Streams(streams.seed, streams.frame + k)
+        exposure_s = times_s[frame_streams.frame % len(times_s)]
         settings = position_settings(task)
-        capture = capture_for_time(camera, task.light, rate_e_per_s, exposure_s, number, clock.take(), **settings)
+        capture = capture_for_time(
+            camera, task.light, rate_e_per_s, exposure_s, frame_streams, clock.take(), **settings
+        )
         check_exposure(camera, task.light, rate_e_per_s, capture)
         yield capture
 
@@ -102,11 +104,11 @@ def _rolling(
     in_progress: deque[tuple[int, Task, Exposure]] = deque()
     clock = Clock()
 
-    def first(last_e_per_s: Floats) -> Capture:
+    def finish_oldest(last_e_per_s: Floats) -> Capture:
         k, task, exposure = in_progress.popleft()
-        number = Streams(streams.seed, streams.frame + k)
+        frame_streams = Streams(streams.seed, streams.frame + k)
         mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | position_settings(task, every)
-        arguments = task.light, mean_e_per_s, exposure.exposure_s, number, clock.take()
+        arguments = task.light, mean_e_per_s, exposure.exposure_s, frame_streams, clock.take()
         return capture_rates(camera, camera.sensor, *arguments, **settings)
 
     rate_e_per_s = np.zeros(1)
@@ -119,9 +121,9 @@ def _rolling(
             for *_, exposure in in_progress:
                 exposure.add(rate_e_per_s)
         while in_progress and in_progress[0][-1].is_complete:
-            yield first(rate_e_per_s)
+            yield finish_oldest(rate_e_per_s)
     while in_progress:
-        yield first(rate_e_per_s)
+        yield finish_oldest(rate_e_per_s)
 
 
 def rates_of_frames(camera: Camera, frames: Iterable[Frame], clock: Clock, ahead: int) -> Iterator[tuple[Task, Floats]]:
@@ -131,16 +133,16 @@ def rates_of_frames(camera: Camera, frames: Iterable[Frame], clock: Clock, ahead
     warned: set[str] = set()
 
     def compute(task: Task) -> tuple[Task, Floats | None, Clock]:
-        own = Clock()
+        task_clock = Clock()
         if task.is_repeated:
-            return task, None, own
+            return task, None, task_clock
         # The first frame of a scene computes the images that its next frames share.
         with image_lock if task.images == {} and camera.axis == "image" else nullcontext():
             gaze_um = task.position_um if task.is_moving else None
-            return task, expected_rates(of_one_frame, task.light, own, gaze_um, task.images, warned), own
+            return task, expected_rates(of_one_frame, task.light, task_clock, gaze_um, task.images, warned), task_clock
 
     rate_e_per_s = np.zeros(camera.layout.n_sites)
-    for task, found, own in in_order(compute, tasks(frames), camera.n_threads, ahead):
+    for task, found, task_clock in in_order(compute, tasks(frames), camera.n_threads, ahead):
         rate_e_per_s = rate_e_per_s if found is None else read_only(found)
-        clock.add(own)
+        clock.add(task_clock)
         yield task, rate_e_per_s

@@ -65,7 +65,7 @@ __all__ = ["Comparison", "cameras", "layouts"]
 
 Method = Literal["cells", "linear", "natural", "least_squares"]
 
-#: Coverage from which a pixel belongs to a camera's picture.
+#: Smallest coverage of a pixel that belongs to a camera's picture.
 MIN_COVERAGE = 0.5
 #: Explanation of a mark in tables.
 BEST_NOTE = "* best value of the row"
@@ -92,11 +92,11 @@ class Comparison:
     values : mapping of str to array
         Metrics by name: (n_camera, n_scene) or (n_camera,); and ``NAME_by_eccentricity`` with an axis of annuli.
     coverage_fraction : (n_camera,) float64
-        Fraction of the common field, the pixels that any camera covers, that each camera covers.
+        Fraction of the field that each camera covers. The field consists of the pixels that any camera covers.
     compared_fraction : float
         Fraction of the field that all cameras cover: pictures are compared there.
     pictures : mapping of str to list of Picture
-        Pictures of each camera for each scene, photons/µm², with the gain that was fitted.
+        Pictures of each camera for each scene, photons/µm², multiplied by the fitted gain.
     ideals : mapping of str to list of Picture
         Their references: the ideal image of each camera on the same grid. They differ between gazes and spectral responses.
     sizes : mapping of str to list of dict
@@ -341,8 +341,8 @@ def cameras(
     method : {"cells", "linear", "natural", "least_squares"}
         Reconstruction, as for :meth:`Capture.picture`.
     metrics : sequence of str
-        Further metrics, by their names in :data:`foveasim.metrics.METRICS`. Those of some photosites are also computed by
-        annulus.
+        Further metrics, by their names in :data:`foveasim.metrics.METRICS`. Those that can be computed for some of the
+        photosites are also computed by annulus.
     progress : function of (n_done, n), optional
 
     Returns
@@ -380,7 +380,7 @@ def cameras(
     metrics = tuple(dict.fromkeys(check_number_name("metrics", name) for name in metrics if name not in COMPARED))
     budgets = {name: budget_of(camera, _rate(frames_per_s, name, exposure_s)) for name, camera in named.items()}
     check_equal_budgets(budgets, budget, tolerance)
-    first = next(iter(named.values()))  # its lens is that of all cameras
+    first = next(iter(named.values()))  # all cameras have the same lens
     all_layouts = [camera.layout for camera in named.values()]
     if scenes is None:
         scenes = photograph_scenes(field_um(all_layouts), first.optics)
@@ -406,12 +406,12 @@ def cameras(
         spectra.append(mean_spectrum(maps[0.0, 0.0], covariance_grid))
         for name, camera in named.items():
             capture = camera.capture(light, exposure_s=exposure_s, seed=seed)
-            known = with_angular_response(camera, light)
-            picture = capture.picture(method, of="light_e", per="um2", grid=grid, sensor=known)
+            sensor_at_angles = with_angular_response(camera, light)
+            picture = capture.picture(method, of="light_e", per="um2", grid=grid, sensor=sensor_at_angles)
             ideal = camera.reference(light, grid, exposure_s=exposure_s)
-            model, own_measures = scene_measures(behind_image(camera), capture, image_of(camera, light, maps), annuli)
-            own_measures |= further_metrics(metrics, ComparedShot(light, camera, exposure_s), capture, annuli)
-            shots[name].append(_Shot(picture, ideal, model, known.light_response(), own_measures))
+            model, shot_measures = scene_measures(behind_image(camera), capture, image_of(camera, light, maps), annuli)
+            shot_measures |= further_metrics(metrics, ComparedShot(light, camera, exposure_s), capture, annuli)
+            shots[name].append(_Shot(picture, ideal, model, sensor_at_angles.light_response(), shot_measures))
             advance()
     covered = [one[0].picture.coverage >= MIN_COVERAGE for one in shots.values()]
     is_common, is_field = (combine(covered, axis=0) for combine in (np.all, np.any))
@@ -425,16 +425,17 @@ def cameras(
     ideals: dict[str, list[Picture]] = {}
     waves = sorted({wave_of(light) for light in lights.values()})
     for name, camera in named.items():
-        own = shots[name]
+        shots_of_camera = shots[name]
         qualities = [
-            quality_by_eccentricity(one.picture, one.ideal, **annuli._asdict(), is_compared=is_common) for one in own
+            quality_by_eccentricity(one.picture, one.ideal, **annuli._asdict(), is_compared=is_common)
+            for one in shots_of_camera
         ]
         per_photon = e_per_photon(camera.sensor, spectra)
-        responses = [per_photon[camera.sensor.filter_of_site] * one.response for one in own]
-        measures = [quality._asdict() | one.measures for quality, one in zip(qualities, own, strict=True)]
+        responses = [per_photon[camera.sensor.filter_of_site] * one.response for one in shots_of_camera]
+        measures = [quality._asdict() | one.measures for quality, one in zip(qualities, shots_of_camera, strict=True)]
         found = (
             {key: [one[key] for one in measures] for key in measures[0]}
-            | information_by_annulus(camera, covariance, responses, [one.model for one in own], annuli)
+            | information_by_annulus(camera, covariance, responses, [one.model for one in shots_of_camera], annuli)
             | layout_measures(camera, waves, annuli, wave_per_mm)
         )
         for metric in metrics:
@@ -442,12 +443,12 @@ def cameras(
                 found |= {key: found[key][0] for key in (metric, metric + BY_ECCENTRICITY)}
         for key, rows in values.items():
             rows.append(found[key])
-        # Pictures of sensors of other sensitivity have the same white.
+        # In photons, pictures of sensors with different sensitivities have the same white.
         scale = 1.0 / per_photon.mean()
         pictures[name] = [
-            _scaled(one.picture, scale * quality.gain) for quality, one in zip(qualities, own, strict=True)
+            _scaled(one.picture, scale * quality.gain) for quality, one in zip(qualities, shots_of_camera, strict=True)
         ]
-        ideals[name] = [_scaled(one.ideal, scale) for one in own]
+        ideals[name] = [_scaled(one.ideal, scale) for one in shots_of_camera]
         advance()
     n_field = np.count_nonzero(is_field)
     return Comparison(

@@ -27,19 +27,22 @@ if TYPE_CHECKING:
 
 __all__ = ["SceneCovariance", "gaussian_information_bits", "scene_covariance", "site_information_bits"]
 
-#: Sites of a block, preceding sites on which it is conditioned, and candidates for these per site.
+#: Number of sites of a block, number of preceding sites on which a block is conditioned, and number of nearest sites among
+#: which these are searched, as a multiple of the sum of both.
 BLOCK_SITES, N_CONDITIONS, CANDIDATE_RATIO = 128, 128, 4
 #: Ratio of the widths of adjacent Gaussian components of a covariance, and the smallest width in pixels.
 WIDTH_RATIO, MIN_WIDTH_PIXELS = 1.08, 0.25
 #: Fraction of the width of images on each side along which their window rises from 0 to 1.
 TAPER_FRACTION = 0.05
-#: Width in pixels from which the mean over a pixel is represented by its second moment: exact to 2e-6.
+#: For Gaussians from this width in pixels on, the mean over a pixel is represented by its second moment: exact to 2e-6.
 MOMENT_WIDTH_PIXELS = 8.0
-#: Lowest frequency of the fit in periods per field, and largest one in cycles per pixel.
+#: Lowest frequency of the fit in periods per field, and highest frequency in cycles per pixel.
 MIN_PERIODS, MAX_FREQUENCY = 2.0, 0.5
-#: Spectral density below which errors do not matter, relative to its mean up to 1/8 cycle per pixel, and fits with new weights.
+#: Spectral density below which errors do not matter, relative to the mean density up to a frequency in cycles per pixel; and
+#: number of fits, each with weights from the fit before.
 DENSITY_FLOOR, FLOOR_FREQUENCY, N_FITS = 3e-3, 0.125, 5
-#: Smallest ratio of the width of a component to the longer side of a site for 1 and 2 Gaussians per axis; 3 below.
+#: A site is represented by 1 Gaussian per axis if the component of the covariance is wider than the first ratio times the
+#: longer side of the site, by 2 if wider than the second ratio, and else by 3.
 MIN_WIDTH_RATIOS = (1.5, 0.25)
 
 
@@ -230,8 +233,8 @@ class _RadialSpectrum:
         lowest = min(MIN_PERIODS / min(shape), 0.5 * MAX_FREQUENCY)
         is_used = (radius >= lowest) & (radius <= MAX_FREQUENCY)
         self._ring = np.full(radius.shape, -1, np.int64)
-        width = np.floor(radius[is_used] * min(shape)).astype(np.int64)
-        self._ring[is_used] = np.unique(width, return_inverse=True)[1].ravel()
+        ring = np.floor(radius[is_used] * min(shape)).astype(np.int64)
+        self._ring[is_used] = np.unique(ring, return_inverse=True)[1].ravel()
         self.n_modes: Floats = self._sums(np.ones(radius.shape))
         self._windows = [tukey(n + 2, 2.0 * TAPER_FRACTION)[1:-1] for n in shape]
         power, n_used = np.zeros(radius.shape), 0
@@ -344,8 +347,8 @@ def site_information_bits(
     Chain rule of the entropy, over blocks of adjacent sites, with the conditional covariance of each block given the nearest
     preceding sites (Vecchia, J. R. Stat. Soc. B 50, 1988; blocks as by Stein et al., ibid. 66, 2004).
 
-    Apertures are sums of equal Gaussians with the second moments of a site and its area: with the integral of the squared
-    aperture. They are exact for structure that is large, and for structure that is small against a site.
+    The aperture of a site is represented by a sum of equal Gaussians with the same second moments and the same integral of the
+    square, the inverse area. This is exact for structure that is much larger or much smaller than the site.
 
     Examples
     --------
@@ -382,9 +385,9 @@ def site_information_bits(
         block = order[start:stop]
         members = np.concatenate((_preceding(xy_um, tree, block, position, start, n_conditions), block))
         signal = apertures.covariance(members)
-        for k, own in enumerate(variance[:, members]):
-            # In units of the noise, for a good condition.
-            deviation = np.sqrt(own)
+        for k, scene_variance in enumerate(variance[:, members]):
+            # In units of the noise, the matrices are well conditioned.
+            deviation = np.sqrt(scene_variance)
             ratio = scale[k, members] / deviation
             total = signal * (ratio[:, np.newaxis] * ratio)
             entropy: Floats | float = 0.0
@@ -398,16 +401,16 @@ def site_information_bits(
                 cholesky = np.linalg.cholesky(total)
             except np.linalg.LinAlgError:
                 rule = "must not be so small that the covariance is singular within rounding"
-                raise ParameterError("noise", rule, float(own.min())) from None
+                raise ParameterError("noise", rule, float(scene_variance.min())) from None
             bits[k, block] = np.log2(np.diagonal(cholesky)[-block.size :]) - entropy
     return bits
 
 
 def _blocks(xy_um: Floats) -> tuple[Ints, Ints]:
     """
-    Return sites in blocks of adjacent ones, (n,), and the first position of each block.
+    Return the sites in blocks of neighbours, (n,), and where each block begins.
 
-    Blocks are halved across their longer side, and followed by n.
+    The layout is halved repeatedly across the longer side of each part. The last entry of the beginnings is n.
     """
     order, starts = np.arange(len(xy_um)), [0]
     pending = [(0, len(xy_um))]
@@ -448,7 +451,8 @@ class _Apertures:
         unit = np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
         across = np.stack((-unit[:, 1], unit[:, 0]), axis=1)
         axes_um = np.stack((long_um[:, np.newaxis] * unit, short_um[:, np.newaxis] * across), axis=1)
-        # In units of a rectangle of the same moments, per axis: 1 for rectangles, larger for other shapes.
+        # Integral of the squared aperture per axis, relative to a rectangle with the same moments: 1 for rectangles, larger for
+        # other shapes.
         norm: Floats = np.asarray(np.sqrt(12.0 * long_um * short_um / layout.area_um2), np.float64)
         n_orders = len(MIN_WIDTH_RATIOS) + 1
         nodes, spread = np.zeros((n_orders, n_orders)), np.ones((layout.n_sites, n_orders))
@@ -473,10 +477,10 @@ class _Apertures:
 
 def _spread_of_norm(node: Floats, norm: Floats) -> Floats:
     """
-    Return the variance of Gaussians that represent a site.
+    Return the variance of each Gaussian of a site, relative to the variance of the site.
 
-    It is a fraction of the second moment of the site. The Gaussians are centred on nodes of variance 1 - fraction, so that the
-    sum has the variance 1. ``norm`` is the integral of the square of the aperture times √12.
+    The centres of the Gaussians have the variance 1 - fraction, so that their sum has the variance 1. ``norm`` is the integral
+    of the square of the aperture times √12.
     """
     fraction = np.geomspace(1.0, 1e-4, 2000)
     apart = np.square(node[:, np.newaxis] - node)[..., np.newaxis] * (1.0 - fraction)

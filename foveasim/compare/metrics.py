@@ -61,7 +61,7 @@ __all__ = [
 #: Smallest number of sites for the spectrum of a region.
 MIN_REGION_SITES = 12
 UM2_PER_MM2 = 1e6
-#: Displacement of images for differences of first order, in cells, and largest uncovered area fraction of a site that is used.
+#: Displacement of images for finite differences, in cells, and largest uncovered area fraction of a site that is used.
 SHIFT_CELLS, MAX_UNCOVERED_FRACTION = 0.05, 1e-9
 #: Relative difference of two charges up to which they are equal.
 ROUNDING = 1e-12
@@ -82,7 +82,7 @@ COMPARED = (
 BY_ECCENTRICITY = "_by_eccentricity"
 #: Frequency of the waves for aliases, in Nyquist frequencies of a square grid of as many sites.
 WAVE_NYQUISTS = 1.5
-#: Annuli around the optical axis of the metrics of one shot.
+#: Number of annuli around the optical axis for metrics of one shot.
 N_ANNULI = 8
 
 
@@ -95,7 +95,7 @@ def layout_measures(camera: Camera, waves: Sequence[Wave], annuli: Annuli, wave_
     """
     Return the measures that do not depend on a scene, in total and by annulus.
 
-    ``waves``: those of the scenes. The MTF of the lens is their mean.
+    ``waves``: waves of the scenes, over which the MTF of the lens is averaged.
     """
     layout = camera.layout
     annulus = annuli.index_of(layout.centroid_um)
@@ -149,7 +149,7 @@ def scene_measures(
     camera: Camera, capture: Capture, image: PowerMap, annuli: Annuli
 ) -> tuple[Linearisation, dict[str, Any]]:
     """
-    Return the model of a capture of an image, its SNR and its precision of a shift.
+    Return the model of a capture, its SNR, and the precision of a shift of its image.
 
     Values of an annulus without sites are NaN.
     """
@@ -180,7 +180,7 @@ def _shift_gradients_e_per_um(camera: Camera, image: PowerMap, exposure_s: float
     """
     grid, layout = image.grid, camera.layout
     uncovered_um2 = camera.integrator(grid, order=camera.order(image)).uncovered_um2
-    moving = copy(camera)  # displaced images do not fill the camera's cache
+    moving = copy(camera)  # so that displaced images do not fill the cache of the camera
 
     def expected_e(x_um: float, y_um: float) -> Floats:
         x0_um, y0_um = grid.origin_um
@@ -189,7 +189,7 @@ def _shift_gradients_e_per_um(camera: Camera, image: PowerMap, exposure_s: float
 
     gradient = np.empty((layout.n_sites, 2))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FoveasimWarning)  # those of the capture
+        warnings.simplefilter("ignore", FoveasimWarning)  # the capture has issued them already
         for axis, step_um in enumerate((SHIFT_CELLS * grid.pitch_xy_um).tolist()):
             x_um, y_um = (step_um, 0.0) if axis == 0 else (0.0, step_um)
             ahead_e, behind_e = expected_e(x_um, y_um), expected_e(-x_um, -y_um)
@@ -264,7 +264,7 @@ def alias_fraction(shot: MetricShot, camera: Camera, capture: Capture) -> float:
 
 
 def _information(shot: MetricShot, camera: Camera, capture: Capture) -> dict[str, Any]:
-    """Return the information about scenes with the covariance of the shot's."""
+    """Return the information about scenes that have the covariance of the shot's scene."""
     light = camera.fit_scene(shot.scene) if isinstance(shot.scene, Scene) else shot.scene
     annuli, _, grid = field_of([camera], (0.0, 0.0), 1, 16)
     image = image_of(camera.with_gaze((0.0, 0.0)), light, {})
@@ -329,7 +329,7 @@ def further_metrics(names: Sequence[str], shot: ComparedShot, capture: Capture, 
 
 
 def metric_rows(names: Sequence[str], interval_of: Callable[[str], MedianInterval]) -> list[list[str]]:
-    """Return title and one value per camera of each metric, from a function of its name."""
+    """Return a row of text per metric: its title, and the interval of each camera."""
     return [
         [
             with_unit(info.title, info.unit),

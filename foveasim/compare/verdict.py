@@ -17,7 +17,7 @@ EQUAL_DB = 0.1
 
 
 def verdict_lines(comparison: Comparison) -> list[str]:
-    """Return two sentences, by eccentricity and over the field, for each other camera."""
+    """Return two sentences per camera after the first: by eccentricity, and over the field."""
     by_annulus = comparison.differences("psnr_db", by_eccentricity=True).median
     over_field = comparison.differences("psnr_db")
     first, *others = comparison.names
@@ -30,14 +30,14 @@ def verdict_lines(comparison: Comparison) -> list[str]:
 
 
 def _by_eccentricity(first: str, other: str, difference_db: Floats, edges_um: Floats) -> str:
-    """Return where which camera has the higher PSNR, from differences (n_annulus,)."""
+    """State at which eccentricities each camera has the higher PSNR."""
     known = np.isfinite(difference_db)
     difference_db, centre_um = difference_db[known], 0.5 * (edges_um[1:] + edges_um[:-1])[known]
     sign = np.where(np.abs(difference_db) > EQUAL_DB, np.sign(difference_db), 0.0)
     if not sign.any():
         return f"{first} and {other} have the same PSNR at all eccentricities, within {EQUAL_DB:g} dB."
     best = {name: float((side * difference_db).max()) for name, side in ((other, 1.0), (first, -1.0))}
-    # Equal annuli belong to the previous different one.
+    # Annuli of equal PSNR continue the annulus before them.
     different = np.flatnonzero(sign)
     sign = sign[different[np.maximum(np.searchsorted(different, np.arange(sign.size), side="right") - 1, 0)]]
     changes = np.flatnonzero(np.diff(sign))

@@ -45,7 +45,7 @@ YAML_EXTENSIONS = (".yaml", ".yml")
 FILE_SETTINGS = ("density", "file", "gaze_path", "importance", "layers", "layout", "path", "picture")
 #: Option of the command line that replaces settings.
 CHANGE = "--set"
-#: Keys of a layout that do not change its photosites before the edits.
+#: Keys of a layout that take effect at its edits or later: they do not change the generated photosites.
 AFTER_EDITS = ("edits", "move_um", "inset_um", "snap_um", "rules", "source")
 #: Tolerance of the aspect ratio of a picture and the rectangle that it covers.
 SHAPE_ROUNDING = 1e-6
@@ -82,7 +82,7 @@ class Shot:
     name : str
         File name without extension.
     scene : Scene or PowerMap
-        A scene with ``fit`` has no pitch: ``camera.fit_scene(scene)`` has.
+        A scene with ``fit`` has no pitch; ``camera.fit_scene(scene)`` has one.
     camera : Camera
     rules : DesignRules or None
         Rules that the layout is designed for.
@@ -272,7 +272,7 @@ def build_shot(
         values = {
             name: value.per_um2 * layout.area_um2 if isinstance(value, PerArea) else value
             for name, value in _values(source, "sensor.", settings.sensor).items()
-            if name != "preset"  # expanded
+            if name != "preset"  # already expanded into its values
         }
         sensor: Sensor = _call(source, "sensor", Sensor, {"layout": layout, **values})
         return sensor
@@ -503,7 +503,7 @@ def _build_layout(
     data: Mapping[str, Any] | None = None,
     cache: Callable[[str, Any, Callable[[], Any]], Any] = _make_uncached,
 ) -> LayoutFile:
-    """Return the layout of a section; with its plain data, layouts of last edits are cached."""
+    """Return the layout of a section; with its plain data, layouts between edits are cached."""
     rules = None
     if getattr(section, "rules", None) is not None:
         rules = _build(source, prefix + "rules", section.rules)
@@ -523,21 +523,21 @@ def _build_layout(
             layout = _edit(source, f"{prefix}edits[{i}]", edits[i], layout, rules)
         return layout
 
-    # The generated layout, and those after the last two edits, are cached: the last edit is the one that changes.
+    # Three layouts are cached: as generated, before the last edit, and after it. Users mostly change the last edit.
     n = len(edits)
     plain = data or {}
 
-    def first() -> Layout:
+    def cached_generated() -> Layout:
         return cache("generated layout", unedited, generated)
 
-    def cached(n_edits: int, make: Callable[[], Layout]) -> Layout:
+    def cached_edited(n_edits: int, make: Callable[[], Layout]) -> Layout:
         return cache("edited layout", [unedited, plain.get("edits", [])[:n_edits], plain.get("rules")], make)
 
-    def last() -> Layout:
-        before = cached(n - 1, lambda: edited(first(), 0, n - 1)) if n > 1 else first()
+    def after_last_edit() -> Layout:
+        before = cached_edited(n - 1, lambda: edited(cached_generated(), 0, n - 1)) if n > 1 else cached_generated()
         return edited(before, n - 1, n)
 
-    layout = cached(n, last) if n else first()
+    layout = cached_edited(n, after_last_edit) if n else cached_generated()
     if any(section.move_um):
         layout = _call(
             source, prefix + "move_um", layout.translate, dict(zip(("dx_um", "dy_um"), section.move_um, strict=True))
@@ -550,7 +550,7 @@ def _build_layout(
 
 
 def _edit(source: Source, key_path: str, section: Any, layout: Layout, rules: DesignRules | None) -> Layout:
-    """Return a layout after an edit, which has the rules of the layout by default."""
+    """Return a layout after an edit; an edit without rules uses those of the layout."""
     call = _callable(section)
     values = _values(source, key_path + ".", section)
     if "rules" in values and values["rules"] is None:

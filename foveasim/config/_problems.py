@@ -20,7 +20,7 @@ from foveasim.errors import ConfigError, ParameterError, format_value
 
 #: Maximum number of problems in one message.
 MAX_PROBLEMS = 3
-#: Problems of pydantic: names that a section or a dataclass does not have, and wrong types with the words for the right one.
+#: Types of problems in pydantic: names that a section or a dataclass does not have; and wrong types, by the right one in words.
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 TYPES = {"int_type": "an integer", "float_type": "a number"}
 
@@ -70,9 +70,9 @@ def plain_settings(source: Source | str | Path | None, value: Any, key_path: tup
 
 
 def adapter_of(name: str, kind: Any) -> TypeAdapter[Any]:
-    """Return the validator of a model, or raise a ParameterError for a parameter that is none."""
+    """Return the validator of a model; raise a ParameterError if ``kind`` is not a model."""
     try:
-        if not isinstance(kind, str):  # the name of a type, for pydantic
+        if not isinstance(kind, str):  # pydantic would read it as the name of a type
             return TypeAdapter(kind)
     except (PydanticUserError, KeyError, TypeError):
         pass
@@ -120,19 +120,19 @@ def _problems(kind: Any, data: dict[str, Any], error: ValidationError) -> list[t
     problems: list[tuple[tuple[str, ...], str]] = []
     # Unknown keys first: a misspelt key is also missing.
     for key_path, item in sorted(found, key=lambda each: each[1]["type"] not in UNKNOWN_KEY):
-        is_shadowed = _is_of_type(item) and any(
-            other[: len(key_path)] == key_path and (len(other) > len(key_path) or not _is_of_type(o))
+        is_shadowed = _is_wrong_type(item) and any(
+            other[: len(key_path)] == key_path and (len(other) > len(key_path) or not _is_wrong_type(o))
             for other, o in found
         )
         if not is_shadowed:
-            # The value of the key that selects the kind of a section.
+            # The path ends with the key that selects the kind of the section.
             tag = [item["ctx"]["discriminator"].strip("'")] if item["type"] == "union_tag_invalid" else []
             types = [TYPES[o["type"]] for other, o in found if other == key_path and o["type"] in TYPES]
             problems.append(((*key_path, *tag), _describe(kind, item, types, is_first=not problems)))
     return list(dict.fromkeys(problems))
 
 
-def _is_of_type(error: Any) -> bool:
+def _is_wrong_type(error: Any) -> bool:
     """Return whether a problem is the type of a value, such as a list instead of a choice."""
     is_choice = error["type"] == "literal_error"
     return error["type"].endswith("_type") or (is_choice and isinstance(error["input"], dict | list))
@@ -163,7 +163,7 @@ def _tags(data: Any) -> tuple[Any, ...]:
 
 def _describe(kind: Any, error: Any, types: list[str], *, is_first: bool) -> str:
     """
-    Return the rule and the value of a problem; for the first unknown name the list.
+    Return the rule and the value of a problem; the first unknown name lists all valid ones.
 
     ``types``: types that are valid instead of a name.
     """

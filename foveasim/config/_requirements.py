@@ -111,7 +111,7 @@ class RegionResult:
 
     @property
     def has_region(self) -> bool:
-        """Whether the result is that of some photosites."""
+        """Whether the result is for some of the photosites only."""
         return any(each is not None for each in (self.annulus_um, self.rectangle_um, self.site))
 
     @property

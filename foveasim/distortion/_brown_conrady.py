@@ -134,7 +134,7 @@ class BrownConrady(LensBase):
         c, s = np.cos(angle_rad)[:, np.newaxis], np.sin(angle_rad)[:, np.newaxis]
         above, below, r = self._parts()
         plain = above * below
-        # r times dR/dr, and r, both multiplied by the square of the denominator.
+        # Products of the square of the denominator with r dR/dr, with r, and (above) with R.
         slope = (r * (above.deriv() * below - above * below.deriv())).coef
         linear = (below * below * r).coef
         size = max(slope.size, linear.size, plain.coef.size)
@@ -192,12 +192,12 @@ class BrownConrady(LensBase):
         inverse = _kernels.brown_conrady_inverse
         pieces = [points[i : i + POINTS_PER_PIECE] for i in range(0, max(len(points), 1), POINTS_PER_PIECE)]
         found = parallel_map(
-            lambda p: inverse(p, k, self.p1, self.p2, self._fold, *self._ideal), pieces, thread_count()
+            lambda p: inverse(p, k, self.p1, self.p2, self._fold, *self._start_radii), pieces, thread_count()
         )
         return np.concatenate(found) if len(found) > 1 else np.asarray(found[0])
 
     @cached_property
-    def _ideal(self) -> tuple[Floats, float]:
+    def _start_radii(self) -> tuple[Floats, float]:
         """
         Table of start values for the inverse.
 

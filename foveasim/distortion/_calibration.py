@@ -260,20 +260,20 @@ def _from_ocamcalib(path: Path, text: str, pixel_um: float, focal_um: float | No
     try:
         rows = [[float(x) for x in line] for line in lines]
         n = int(rows[0][0])
-        direct = rows[0][1:]
+        polynomial = rows[0][1:]
         centre, affine, size = rows[2][:2], rows[3][:3], rows[4][:2]
     except (ValueError, IndexError, OverflowError):
         raise ConfigError(
             path, "must have the five lines of numbers of calib_results.txt: polynomial, inverse, centre, affine, size"
         ) from None
-    if n != len(direct) or n != 5 or direct[1] != 0.0 or len(centre) + len(affine) + len(size) != 7:
+    if n != len(polynomial) or n != 5 or polynomial[1] != 0.0 or len(centre) + len(affine) + len(size) != 7:
         raise ConfigError(
             path, "must have the five coefficients a0, 0, a2, a3, a4, the centre, c d e and the image size"
         )
     c, d, e = affine
     # OCamCalib's x axis points down (row index), its y axis to the right (column index).
     return Scaramuzza(
-        a=[direct[0], direct[2], direct[3], direct[4]],
+        a=[polynomial[0], polynomial[2], polynomial[3], polynomial[4]],
         pixel_um=pixel_um,
         focal_um=_require_focal_um(path, focal_um),
         stretch=[[1.0, -e], [-d, c]],

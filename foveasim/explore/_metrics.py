@@ -92,10 +92,10 @@ def add_metrics(metrics: Mapping[str, Metric], names: Iterable[str]) -> dict[str
     """
     found = dict(metrics)
     for name in names:
-        for own, metric in resolve_metrics([import_metric(name) if ":" in name else name]).items():
-            if own in found:
-                raise ParameterError("metric", "must have a unique name; another metric has this name", own)
-            found[own] = metric
+        for result, metric in resolve_metrics([import_metric(name) if ":" in name else name]).items():
+            if result in found:
+                raise ParameterError("metric", "must have a unique name; another metric has this name", result)
+            found[result] = metric
     return found
 
 
@@ -106,5 +106,5 @@ def has_result(metric: str, result: str) -> bool:
 
 def reference_of(metric: Metric) -> Callable[..., Any] | None:
     """Return the function that computes the reference of a registered metric, if it has one."""
-    name = next((name for name, own in METRICS.items() if own is metric), None)
+    name = next((name for name, registered in METRICS.items() if registered is metric), None)
     return None if name is None else metric_info(name).reference

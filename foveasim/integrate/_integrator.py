@@ -44,8 +44,8 @@ class Integrator:
         Order of the reconstruction within cells: 1 treats cells as constant, 2 as a mean with a gradient, so that linear maps
         are also exact.
     compiled : bool
-        Whether to store the overlaps of sites and cells. Without, the outlines are traced at every call: for layouts and
-        positions that are used for one or two maps. Axis-aligned rectangles need no overlaps in either case.
+        Whether to store the overlaps of sites and cells. If not, the outlines are traced at every call, which is faster for
+        layouts and positions that are used for one or two maps. Axis-aligned rectangles need no overlaps in either case.
     n_threads : int, optional
         Number of threads, by default all cores of the process. Results are bit-identical for any number.
 
@@ -148,7 +148,7 @@ class Integrator:
 
     @cached_property
     def _compiled(self) -> Plan:
-        """Spans of all outlines; rectangles need them for matrices and adjoints only."""
+        """Spans of all outlines; for layouts of rectangles only matrices and adjoints need them."""
         return self._overlaps if isinstance(self._overlaps, Plan) else self._compile()[0]
 
     @property
@@ -174,7 +174,7 @@ class Integrator:
         """
         Bounding box (x_min, y_min, x_max, y_max) of the outlines in the plane of the map, µm.
 
-        Sites outside the image circle do not count; NaN without others.
+        Sites outside the image circle do not count; NaN if there are no other sites.
         """
         return self._overlaps.coverage.bounds_um
 

@@ -15,7 +15,7 @@ from foveasim.integrate._coverage import Coverage
 
 #: Sites per work item; results do not depend on it.
 SITES_PER_PIECE = 2**15
-#: Number of sites that decide whether the others may be rectangles.
+#: Number of sites that are checked first: if they are not rectangles, the others are not checked.
 FIRST_SITES = 4
 #: Up to this number of sites are integrated by the calling thread.
 FEW_SITES = 2**12
@@ -71,9 +71,9 @@ class RectanglePlan:
 @dataclass(frozen=True, eq=False)
 class LatticePlan:
     """
-    Rectangles in rows and columns, with the lower and upper ends of each in cells.
+    Rectangles in rows and columns.
 
-    ``u`` (n_column, 2), ``v`` (n_row, 2).
+    ``u`` (n_column, 2), ``v`` (n_row, 2): lower and upper ends of the columns along x, and of the rows along y, in cells.
     """
 
     grid: Grid

@@ -24,11 +24,11 @@ Order: TypeAlias = Literal[1, 2]
 @dataclass(frozen=True, eq=False)
 class SharedEdges:
     """
-    Edges of outlines, each shared edge once.
+    Edges of outlines, in which an edge that two sites share occurs once.
 
-    ``point`` (n_vertex,): identity of each vertex: vertices of the same number have the same position. The properties have
-    one element per vertex, except the vertices ``begin`` and ``end`` of each edge, from the lower to the higher number of
-    the point.
+    ``point`` (n_vertex,): number of the position of each vertex; vertices at the same position have the same number. The
+    properties have one element per vertex, except ``begin`` and ``end``: they are the vertices of each edge, which leads from
+    the lower to the higher point number.
     """
 
     ring_offsets: Ints
@@ -40,7 +40,7 @@ class SharedEdges:
         """Return the edges of a layout; vertices with equal coordinates are the same point."""
         if not all(hasattr(layout, name) for name in ("xy_um", "ring_offsets", "site_offsets")):
             raise ParameterError("layout", f"must be a Layout or packed rings, got {type_name(layout)}")
-        # + 0.0: -0.0 and 0.0 are the same position.
+        # -0.0 + 0.0 is 0.0: both are the same position.
         position = np.ascontiguousarray(layout.xy_um + 0.0).view(np.complex128)[:, 0]
         return cls(layout.ring_offsets, layout.site_offsets, np.unique(position, return_inverse=True)[1])
 
@@ -69,6 +69,7 @@ class SharedEdges:
 
     @cached_property
     def _unique(self) -> tuple[Ints, Ints]:
+        """First vertex that has each edge, and number of the edge after each vertex."""
         low, high = np.sort(np.stack((self.point, self.point[self.after])), axis=0)
         _, first, edge = np.unique(
             low * (int(self.point.max(initial=0)) + 1) + high, return_index=True, return_inverse=True
@@ -140,7 +141,7 @@ class EdgeMoments:
         return out
 
     def spread(self, weights: Floats) -> Floats:
-        """Return maps (n_map, n_y, n_x): the adjoint of :meth:`measure` for its weights."""
+        """Return maps (n_map, n_y, n_x) from weights of moments: the adjoint of :meth:`measure`."""
         from foveasim.integrate import _shape_kernels
 
         cells = np.zeros((weights.shape[0], *self.grid.shape))
@@ -197,8 +198,8 @@ def vertex_gradient(
     order : {1, 2}
         Order of integration, as for :class:`foveasim.Integrator`.
     edges : SharedEdges, optional
-        Edges of the layout, or of one with the same vertices at other positions; by default those with equal coordinates
-        are found in every call.
+        Edges of the layout, or of a layout with the same edges at other positions. By default every call finds them from the
+        coordinates.
     n_threads : int, optional
         Number of threads, by default all cores of the process. Results are bit-identical for any number.
 
@@ -264,9 +265,9 @@ def _contract(xy_um: Floats, edges: SharedEdges, moments: Floats, site_weights: 
         for moment, weight in zip(moments, site_weights, strict=True):
             of_vertex += moment[edges.edge] * weight[edges.site, np.newaxis]
     along = xy_um[edges.after] - xy_um
-    own, next_one = of_vertex[:, 0], of_vertex[:, 1]
-    from_begin = np.where(edges.is_reversed, next_one, own)
-    from_end = np.where(edges.is_reversed, own, next_one)
+    from_low, from_high = of_vertex[:, 0], of_vertex[:, 1]  # ends of the stored edge
+    from_begin = np.where(edges.is_reversed, from_high, from_low)
+    from_end = np.where(edges.is_reversed, from_low, from_high)
     gradient = np.empty(xy_um.shape)
     for axis, normal in ((0, along[:, 1]), (1, -along[:, 0])):
         np.multiply(normal, from_begin, out=gradient[:, axis])

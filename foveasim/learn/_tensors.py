@@ -24,11 +24,11 @@ from foveasim.errors import ParameterError, type_name
 
 #: Number of times that a step is halved before it is cancelled.
 MAX_HALVINGS = 8
-#: Size of a block whose release lets the allocator keep memory, bytes: just below the largest one that it observes.
+#: Size in bytes of a block that is allocated and released once: just below the largest one to which the allocator adapts.
 LARGEST_BLOCK = 2**25 - 2**16
 
 # The allocator of Linux returns free memory above twice the largest released block to the system, and later blocks cost page
-# faults: 40 % of the time of a batch. The block is never written, so that it needs no memory.
+# faults: 40 % of the time of a batch. After this release it keeps more. The block is never written, so that it needs no memory.
 torch.empty(LARGEST_BLOCK, dtype=torch.uint8)
 
 
@@ -100,7 +100,7 @@ class Constants:
 
     def get(self, name: str, like: Tensor, compute: Callable[[], Any] | None = None) -> Tensor:
         """
-        Return an array as a tensor on the device of another one.
+        Return an array as a tensor on the device of ``like``.
 
         ``compute`` returns the array if it is not yet known. Floating-point and complex numbers have the precision of ``like``,
         integers their own.
@@ -117,7 +117,7 @@ class Constants:
                 found = torch.from_numpy(np.array(values))
                 # First the precision: some devices have no float64.
                 found = (found.to(precision) if values.dtype.kind in "fc" else found).to(like.device)
-            if type(found) is Tensor:  # none of a tracer
+            if type(found) is Tensor:  # tensors of a tracer are not kept
                 self._tensors[key] = found
         return found
 
@@ -147,7 +147,7 @@ class SparseMap:
         return found
 
     def tensor(self, like: Tensor, *, is_transposed: bool = False) -> Tensor:
-        """Return the matrix, or the transposed one, as a CSR tensor on the device of another one."""
+        """Return the matrix, or the transposed one, as a CSR tensor on the device of ``like``."""
         key = is_transposed, like.device, like.dtype
         found = self._tensors.get(key)
         if found is None:
@@ -180,7 +180,7 @@ class SparseMap:
 
             found = rows.new_empty(rows.shape[0], self.shape[0])
             multiply_rows(*self._arrays(rows), rows.contiguous().numpy(), found.numpy())
-        elif torch.compiler.is_compiling():  # in operations that other runtimes have
+        elif torch.compiler.is_compiling():  # only operations that other runtimes also have
             get = partial(self._constants.get, like=rows)
             data = get("data", compute=lambda: self.entries.data)
             products = rows.index_select(1, get("column", compute=lambda: self.entries.col)) * data
@@ -215,9 +215,9 @@ class _Product(torch.autograd.Function):
 
 def is_array(tensor: Tensor) -> bool:
     """
-    Return whether a tensor is a mere array for kernels.
+    Return whether kernels may read and write the memory of a tensor directly.
 
-    In memory, and without derivatives, transforms, tracers and modes that see operations.
+    The tensor must be in CPU memory, and no derivative, transform, tracer or mode may depend on seeing its operations.
     """
     if type(tensor) is not Tensor or tensor.device.type != "cpu" or tensor.dtype not in (torch.float32, torch.float64):
         return False
@@ -251,24 +251,24 @@ def in_parts(
     """
     Return the results of a function for parts of the rows of tensors.
 
-    Without derivatives, each core of the CPU computes parts of its own: cores that work on one operation together exchange data
-    through a common cache, or memory. Results are bit-identical for any number of threads.
+    Without derivatives, each core of the CPU computes different parts. This is faster than cores that share each operation,
+    because they exchange data through a common cache or memory. Results are bit-identical for any number of threads.
 
     Parameters
     ----------
     compute : callable
-        Of a part of each tensor.
+        Function of a part of each tensor.
     parts : Parts
     *tensors : tensor or None
     finish : callable
-        Of the result of each part, in the order of the parts, as random numbers require.
+        Function of the result of each part, called in the order of the parts, as random numbers require.
     """
     first_part, *others = parts.slices
 
     def result_of(part: slice) -> Tensor:
         return compute(*(None if each is None else each[part] for each in tensors))
 
-    first = finish(result_of(first_part))  # creates the constants
+    first = finish(result_of(first_part))  # alone, because it creates the constants that all parts share
     if not others:
         return first
     if first.requires_grad:
@@ -306,8 +306,8 @@ def in_parts(
 
 
 def _count_threads(parts: Parts) -> int:
-    """Return the number of threads that compute parts, or 1 where all work on each part."""
-    if torch.is_autocast_enabled("cpu"):  # which other threads do not know
+    """Return the number of threads that compute different parts; 1: all share each part."""
+    if torch.is_autocast_enabled("cpu"):  # other threads do not inherit it
         return 1
     n_threads, n_parts = min(torch.get_num_threads(), thread_count()), len(parts.slices) - 1
     return min(n_threads, parts.n_together) if 2 * n_parts > n_threads else 1
@@ -316,16 +316,16 @@ def _count_threads(parts: Parts) -> int:
 @cache
 def _pool(n_threads: int) -> ThreadPoolExecutor:
     """Return threads in which operations of torch use one thread each."""
-    n_own, start = torch.get_num_threads(), Barrier(n_threads)
+    n_before, start = torch.get_num_threads(), Barrier(n_threads)
 
     def initialise() -> None:
-        torch.get_num_threads()  # a later first request would set the default again
+        torch.get_num_threads()  # the first call in a thread sets the default, so that it must precede the next line
         torch.set_num_threads(1)
 
     pool = ThreadPoolExecutor(n_threads, "foveasim layers", initialise)
     wait([pool.submit(start.wait) for _ in range(n_threads)])
     # The last number that any thread sets is the default of those that start later.
-    torch.set_num_threads(n_own)
+    torch.set_num_threads(n_before)
     return pool
 
 
@@ -342,8 +342,8 @@ def shorten_steps(start: Tensor, target: Tensor, find_invalid: Callable[[Tensor]
     """
     Return the fraction of the step of each row that gives a valid state, (n, 1) or (n,).
 
-    ``find_invalid`` sets a state, and returns the rows whose steps make it invalid, as a mask, or None. Their steps are halved,
-    and cancelled after 8 times; then those of all others, which moved further.
+    ``find_invalid`` sets a state, and returns a mask of the rows whose steps make it invalid, or None. Their steps are halved,
+    and cancelled after 8 halvings. If the state is still invalid, the steps of all other rows are halved in the same way.
     """
     target = torch.where(torch.isfinite(target), target, start)
     fraction = torch.ones_like(target[..., :1] if target.ndim > 1 else target)

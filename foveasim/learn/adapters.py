@@ -22,7 +22,7 @@ from foveasim.learn.layer import SensorLayer
 __all__ = ["from_fovi", "physics", "to_fovi", "transform"]
 
 RADIUS = Limits(above=0.0)
-#: Sides of the polygon around the samples of FOVI.
+#: Number of sides of the polygon that represents the circle around the samples of FOVI.
 CHORDS = 720
 
 
@@ -37,13 +37,13 @@ def physics(layer: SensorLayer, *, generator: torch.Generator | None = None, **o
     generator : torch.Generator, optional
         Random numbers of the noise, on the device of the pictures.
     **options
-        Of ``deepinv.physics.LinearPhysics``, such as ``max_iter`` and ``solver`` of the pseudoinverse.
+        Options of ``deepinv.physics.LinearPhysics``, such as ``max_iter`` and ``solver`` of the pseudoinverse.
 
     Returns
     -------
     deepinv.physics.LinearPhysics
         ``A`` maps pictures (batch, channel, row, column) to the expected charges of light (batch, n_site), in units of
-        ``unit_e``, the largest one for a white picture; ``A_adjoint`` is the product with the transposed matrix. The noise
+        ``unit_e``, the largest charge for a white picture; ``A_adjoint`` is the product with the transposed matrix. The noise
         model draws charges with the temporal noise of the sensor, and subtracts the expected dark signal.
 
     Raises
@@ -198,8 +198,8 @@ def from_fovi(samples: Any, *, radius_um: Annotated[float, RADIUS]) -> Layout:
     Returns
     -------
     Layout
-        In the order of the samples, which are the columns ``sample_x_um`` and ``sample_y_um``; within a circle that extends
-        beyond the outermost samples by half their distance from their neighbours.
+        Cells in the order of the samples, with the positions of the samples as columns ``sample_x_um`` and ``sample_y_um``.
+        They fill a circle that extends beyond the outermost sample by half the distance to its nearest neighbour.
 
     Raises
     ------

@@ -67,7 +67,7 @@ def with_coefficients(lens: Lens, names: Iterable[str], values: Any) -> Lens:
 
 
 def _scale(lens: Lens, name: str) -> float:
-    """Return the size of a coefficient for strong distortion at one focal length."""
+    """Return the size of a coefficient that distorts strongly at a radius of a focal length."""
     if name.startswith("a["):  # of Scaramuzza: a0 + a2 r² + a3 r³ + a4 r⁴, in pixels
         focal = abs(_get(lens, "a[0]"))
         return focal ** (1.0 - (0, 2, 3, 4)[int(name[2:-1])])

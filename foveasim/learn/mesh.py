@@ -17,7 +17,7 @@ __all__ = ["Mesh"]
 
 #: Turning angle (rad) up to which a vertex of the boundary is not a corner.
 STRAIGHT_RAD = 1e-6
-#: Edges below this length are points.
+#: Edges below this length count as points without a direction.
 MIN_EDGE_UM = 1e-9
 
 

@@ -21,9 +21,9 @@ from foveasim.learn.outlines import Outlines
 
 __all__ = ["PowerCells"]
 
-#: Sides of the region by number: 0 is none, then left, right, bottom, top.
+#: Number of sides of the region: 1 is left, 2 right, 3 bottom, 4 top; 0 stands for no side.
 N_SIDES = 4
-#: Difference between the total area of all cells and the area of the region that rounding may cause, relative to it.
+#: Largest relative difference between the total area of all cells and the area of the region that is a rounding error.
 AREA_ROUNDING = 1e-9
 
 
@@ -56,8 +56,8 @@ class PowerCells(nn.Module):
 
     Notes
     -----
-    The topology is computed from scratch in each call. The corners are functions of three centres each (Aurenhammer 1987), and
-    their derivatives those of these functions. Where four or more cells meet in one point, as on a regular grid, the corners
+    The topology is computed from scratch in each call. Each corner is a differentiable function of three centres and their
+    weights (Aurenhammer 1987). Where four or more cells meet in one point, as on a regular grid, the corners
     are separate points at equal positions, with edges of length zero between them. First derivatives of integrals over cells
     are then exact, which they would not be with one common point. :meth:`layout` merges these points.
 
@@ -170,9 +170,9 @@ class PowerCells(nn.Module):
         """
         Shorten the last step of an optimiser such that all cells are valid: a line search.
 
-        No cell is empty then, and no centre outside the region. The step is the change since the previous call, or since the
-        object was created. The steps of invalid centres and of their weights are halved until all cells are valid, and
-        cancelled after 8 times; then those of all others.
+        Afterwards no cell is empty, and no centre is outside the region. The step is the change since the previous call, or
+        since the object was created. The steps of invalid centres and of their weights are halved until all cells are valid,
+        and cancelled after 8 halvings; if this is not enough, the steps of all other centres are halved in the same way.
 
         Returns
         -------
@@ -337,7 +337,7 @@ def _images(centres_um: Floats, region_um: Floats) -> Floats:
 
 
 def _regular_triangles(points_um: Floats, weights_um2: Floats, n_centres: int, region_um: Floats) -> Ints:
-    """Return the triangles (n_triangle, 3) of the regular triangulation with a centre."""
+    """Return the triangles (n_triangle, 3) of the regular triangulation that have a centre."""
     from scipy.spatial import ConvexHull, QhullError
 
     offset = points_um - 0.5 * (region_um[:2] + region_um[2:])
@@ -375,7 +375,7 @@ def _order_around_centres(triangles: Ints, points_um: Floats, n_centres: int) ->
 
 def _canonical(centre: Ints, side: Ints) -> tuple[Ints, Ints, Ints, Ints]:
     """
-    Return the same key for all triangles with the same corner for reasons of symmetry.
+    Return equal keys for triangles whose corners are the same point by symmetry.
 
     Two centres and their images across one side have one common corner on this side, whichever three of them form the triangle.
     """

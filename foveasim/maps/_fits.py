@@ -60,7 +60,7 @@ def write(power_map: PowerMap, path: Path) -> None:
 def read(path: Path, name: str | None) -> Found:
     """Read the image with a name or number, or the first image."""
     with open_fits(path) as file:
-        hdu = _image(file, name)
+        hdu = _find_image(file, name)
         header = hdu.header
         data = read_image(hdu, path.stat().st_size)
         n_axes = data.ndim
@@ -71,8 +71,8 @@ def read(path: Path, name: str | None) -> Found:
         return replace(found, **_header_values(header, data.shape, n_axes))
 
 
-def _image(file: Any, name: str | None) -> Any:
-    """Return the header-data unit of the map."""
+def _find_image(file: Any, name: str | None) -> Any:
+    """Return the header-data unit with a name or number, or the first image."""
     for number in range(MAX_HDUS):
         try:
             hdu = file[number]
@@ -93,13 +93,13 @@ def _header_values(header: Any, shape: tuple[int, ...], n_axes: int) -> dict[str
     """Return pitch, origin, wavelengths and unit from a header."""
     metadata: dict[str, Any] = _plane_values(header, shape)
     if n_axes >= 3 and str(header.get("CTYPE3", "")).strip().upper() in WAVES:
-        per = length_in_um(str(header.get("CUNIT3", "m")))
+        unit_um = length_in_um(str(header.get("CUNIT3", "m")))
         step, start = _step(header, 3), _number(header, "CRVAL3", 0)
-        if per is None:
+        if unit_um is None:
             raise FormatError(f"has the wavelength unit {str(header.get('CUNIT3'))!r:.20}, expected a unit of length")
         if step is not None:
             channel = np.arange(shape[-3]) + 1.0 - _number(header, "CRPIX3", 1)
-            metadata["wavelength_nm"] = ((start + step * channel) * (per * 1e3)).tolist()
+            metadata["wavelength_nm"] = ((start + step * channel) * (unit_um * 1e3)).tolist()
     unit = header.get("BUNIT")
     if isinstance(unit, str) and unit.strip():
         metadata["unit"] = unit
@@ -107,19 +107,20 @@ def _header_values(header: Any, shape: tuple[int, ...], n_axes: int) -> dict[str
 
 
 def _plane_values(header: Any, shape: tuple[int, ...]) -> dict[str, Any]:
+    """Return pitch, origin and directions of the axes x and y, as far as they are known."""
     steps = [_step(header, axis) for axis in (1, 2)]
-    units = [length_in_um(str(header.get(f"CUNIT{axis}", ""))) for axis in (1, 2)]
-    if None not in steps and None not in units:
+    units_um = [length_in_um(str(header.get(f"CUNIT{axis}", ""))) for axis in (1, 2)]
+    if None not in steps and None not in units_um:
         metadata: dict[str, Any] = {"is_x_descending": steps[0] < 0.0, "is_y_descending": steps[1] < 0.0}  # type: ignore[operator]
-        pitch, low = [], []
-        for axis, (step, per, n) in enumerate(zip(steps, units, shape[::-1][:2], strict=True), start=1):
+        pitch, origin = [], []
+        for axis, (step, unit_um, n) in enumerate(zip(steps, units_um, shape[::-1][:2], strict=True), start=1):
             assert step is not None
-            assert per is not None
+            assert unit_um is not None
             start, at = _number(header, f"CRVAL{axis}", 0), _number(header, f"CRPIX{axis}", 1)
             edges = (start + step * (0.5 - at), start + step * (n + 0.5 - at))
-            pitch.append(abs(step) * per)
-            low.append(min(edges) * per)
-        return {**metadata, "pitch_um": tuple(pitch), "origin_um": tuple(low)}
+            pitch.append(abs(step) * unit_um)
+            origin.append(min(edges) * unit_um)
+        return {**metadata, "pitch_um": tuple(pitch), "origin_um": tuple(origin)}
     sizes = [header.get("XPIXSZ"), header.get("YPIXSZ", header.get("XPIXSZ"))]
     if all(isinstance(size, int | float) and size > 0 for size in sizes):
         return {"pitch_um": tuple(map(float, sizes))}
@@ -128,10 +129,10 @@ def _plane_values(header: Any, shape: tuple[int, ...]) -> dict[str, Any]:
 
 def _step(header: Any, axis: int) -> float | None:
     """Return the step along an axis, None if the header has none."""
-    for one in (1, 2, 3):
+    for other in (1, 2, 3):
         for prefix in ("CD", "PC"):
-            if one != axis and (
-                _number(header, f"{prefix}{axis}_{one}", 0) or _number(header, f"{prefix}{one}_{axis}", 0)
+            if other != axis and (
+                _number(header, f"{prefix}{axis}_{other}", 0) or _number(header, f"{prefix}{other}_{axis}", 0)
             ):
                 raise FormatError("has rotated coordinate axes; resample it without rotation")
     if f"CD{axis}_{axis}" in header:

@@ -32,7 +32,7 @@ def map_metadata(power_map: PowerMap) -> dict[str, Any]:
 
 def found_in_metadata(text: str, data: NDArray[Any], *, is_y_descending: bool) -> Found:
     """
-    Return the map with the metadata of a string that foveasim wrote.
+    Return a map with the metadata of a string; without them if foveasim did not write it.
 
     Raises FormatError if the string has the format of foveasim and is invalid.
     """

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 #: Name of the map in a file with several arrays.
 NAME = "irradiance"
-#: Largest difference, in cells, of coordinates from the pitch and origin in attributes: rounding errors.
+#: Largest rounding error, in cells, between coordinates and the grid of the pitch and origin in attributes.
 ROUNDING = 1e-6
 
 
@@ -156,27 +156,27 @@ def _axis_metadata(array: xr.DataArray, x: Floats, y: Floats, names: tuple[Hasha
     """Return axis directions, and pitch and origin if the coordinates have units of length."""
     step_x, step_y = pitch_of_axes(x, y)
     metadata: dict[str, Any] = {"is_x_descending": (step_x or 1.0) < 0.0, "is_y_descending": (step_y or 1.0) < 0.0}
-    per = [length_of_coordinate(array.coords[name], name) for name in names]
-    if None in per:
+    units_um = [length_of_coordinate(array.coords[name], name) for name in names]
+    if None in units_um:
         return metadata
-    per_x, per_y = (p for p in per if p is not None)
-    exact = _exact_grid(array, x * per_x, y * per_y)
+    unit_x_um, unit_y_um = (unit for unit in units_um if unit is not None)
+    exact = _exact_grid(array, x * unit_x_um, y * unit_y_um)
     if exact is not None:
         return {**metadata, "pitch_um": (exact.pitch_x_um, exact.pitch_y_um), "origin_um": exact.origin_um}
     if step_x is None and step_y is None:
         return metadata
-    pitch_x = abs(step_x) * per_x if step_x is not None else None
-    pitch_y = abs(step_y) * per_y if step_y is not None else None
+    pitch_x = abs(step_x) * unit_x_um if step_x is not None else None
+    pitch_y = abs(step_y) * unit_y_um if step_y is not None else None
     pitch = (pitch_x or pitch_y or 0.0, pitch_y or pitch_x or 0.0)
-    low = (float(x.min()) * per_x - 0.5 * pitch[0], float(y.min()) * per_y - 0.5 * pitch[1])
-    return {**metadata, "pitch_um": pitch, "origin_um": low}
+    origin = (float(x.min()) * unit_x_um - 0.5 * pitch[0], float(y.min()) * unit_y_um - 0.5 * pitch[1])
+    return {**metadata, "pitch_um": pitch, "origin_um": origin}
 
 
 def _exact_grid(array: xr.DataArray, x_um: Floats, y_um: Floats) -> Grid | None:
     """
     Return the exact grid from the attributes, or None if the coordinates differ from it.
 
-    A slice of an array has the attributes of the complete array.
+    They differ in a slice, which keeps the attributes of the complete array.
     """
     pitch, origin = array.attrs.get("pitch_um"), array.attrs.get("origin_um")
     if pitch is None or origin is None:

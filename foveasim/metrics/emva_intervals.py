@@ -89,13 +89,14 @@ class EmvaIntervals:
 
 class Jackknife:
     """
-    Standard errors and intervals from values without each block of sites.
+    Standard errors and intervals from estimates that leave out one block of sites each.
 
-    ``n_blocks_of_class`` (n_class,) int64: number of blocks of each class; further blocks are empty.
+    ``n_blocks_of_class`` (n_class,) int64: number of blocks of each class; further blocks are empty. In all methods,
+    ``values[0]`` is the estimate from all sites, and ``values[1 + k]`` the estimate without block k.
 
-    Delete-a-group jackknife: with g blocks, the variance of an estimate is ``(g - 1) / g`` times the sum of the squares of the
-    deviations from their mean of the estimates without one block (J. Shao and D. Tu, The jackknife and bootstrap, Springer,
-    1995, chapter 2). Intervals use Student's distribution with g - 1 degrees of freedom.
+    Delete-a-group jackknife: with g blocks, the variance of an estimate is ``(g - 1) / g`` times the sum of squared deviations
+    of the g estimates without one block from their mean (J. Shao and D. Tu, The jackknife and bootstrap, Springer, 1995,
+    chapter 2). Intervals use Student's distribution with g - 1 degrees of freedom.
     """
 
     def __init__(self, n_blocks_of_class: Ints) -> None:
@@ -127,8 +128,9 @@ class Jackknife:
 
         ``is_used``: (n_value, n_class) bool.
 
-        With the probability of the interval, at least, all values are within their simultaneous limits (Bonferroni), and so are
-        their extremes: the smallest of the lower limits and the smallest of the upper limits bound the smallest value.
+        With at least the probability of the interval, all values are within their simultaneous limits (Bonferroni). Then the
+        smallest of the lower limits and the smallest of the upper limits bound the smallest value, and the same applies to the
+        largest.
         """
         half = self.quantile(is_used.sum(axis=0)) * self.error(values)
         low, high = values[0] - half, values[0] + half

@@ -53,9 +53,9 @@ def psnr_db(
     >>> float(round(psnr_db([[1.0, 2.0], [3.0, np.nan]], [[1.1, 2.1], [2.9, 7.0]], data_range=1.0), 6))
     20.0
     """
-    one, other, is_compared = _prepare_comparison(picture, reference, min_coverage)
-    difference2 = float(np.mean((one - other)[:, is_compared] ** 2))
-    peak = _data_range(other[:, is_compared], data_range)
+    image, ideal, is_compared = _prepare_comparison(picture, reference, min_coverage)
+    difference2 = float(np.mean((image - ideal)[:, is_compared] ** 2))
+    peak = _data_range(ideal[:, is_compared], data_range)
     return math.inf if difference2 == 0.0 else 10.0 * math.log10(peak * peak / difference2)
 
 
@@ -97,13 +97,13 @@ def ssim(
     >>> round(fs.metrics.ssim(picture, picture), 6), round(fs.metrics.ssim(0.5 * picture + 0.25, picture), 3)
     (1.0, 0.801)
     """
-    one, other, is_compared = _prepare_comparison(picture, reference, min_coverage)
+    image, ideal, is_compared = _prepare_comparison(picture, reference, min_coverage)
     if window % 2 == 0:
         raise ParameterError("window", "must be odd", window)
-    peak = _data_range(other[:, is_compared], data_range)
+    peak = _data_range(ideal[:, is_compared], data_range)
     # scikit-image requires numbers also in excluded pixels
-    one, other = (np.where(is_compared, plane, 0.0) for plane in (one, other))
-    similarity, fits = ssim_map(one, other, is_compared, peak, window=window)
+    image, ideal = (np.where(is_compared, plane, 0.0) for plane in (image, ideal))
+    similarity, fits = ssim_map(image, ideal, is_compared, peak, window=window)
     if not fits.any():
         raise ParameterError("window", "must fit within the compared pixels", window)
     return float(np.mean(similarity[fits]))

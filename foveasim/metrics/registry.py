@@ -1,7 +1,7 @@
 """
 Metrics of shots: scalar results by name, with title, unit and direction.
 
-Sweeps, studies, requirements, goal seek, comparisons and the studio have the same ones.
+Sweeps, studies, requirements, goal seek, comparisons and the studio use the same metrics.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Region(Protocol):
 
 
 #: Function of a shot, its camera and its capture that returns a number, a mapping of names to numbers, or a labelled array.
-#: It has a region if it has one of the optional parameters ``sites`` (indices of photosites) or ``region``.
+#: It can be computed for a region if it has one of the optional parameters ``sites`` (indices of photosites) or ``region``.
 Metric = Callable[..., Any]
 
 
@@ -98,18 +98,18 @@ class MetricInfo:
     better : {"high", "low"}, optional
         Which values are better; None for neither, as of the mean code.
     has_scene : bool
-        Whether it depends on the scene, or on the layout and the lens alone.
+        Whether the metric depends on the scene, or on the layout and the lens alone.
     is_logarithmic : bool
         Whether axes are logarithmic.
     headline : str
-        Item of a mapping that stands for it where one number is required.
+        Key of the number that represents a metric of several numbers where one is required.
     is_number : bool
-        Whether it can stand for one number.
+        Whether the metric is one number, or has a headline.
     jumps_to_zero : bool
         Whether 0 means that there is no result, as the signal-to-noise ratio of saturated sites.
     reference : function of a shot and its camera, optional
-        Computes an argument ``reference`` of the metric. It must depend on the photoelectron rates of an ideal raster, exposure
-        time and bit depth only: captures share it.
+        Computes the argument ``reference`` of the metric. It may depend only on the photoelectron rates of an ideal raster,
+        the exposure time and the bit depth, because captures share the result.
 
     Examples
     --------
@@ -133,7 +133,7 @@ class MetricInfo:
     __repr__ = short_repr
 
 
-#: Metrics by name, asked by sweeps, studies, requirements, goal seek, comparisons and the studio. Facts are registered with
+#: Metrics by name, for sweeps, studies, requirements, goal seek, comparisons and the studio. Facts are registered with
 #: ``@METRICS.register(name, info=MetricInfo(...))``, and have defaults. Installed packages add metrics as entry points of the
 #: group ``foveasim.metrics``.
 METRICS: Registry[Metric] = Registry(
@@ -165,7 +165,7 @@ def options_of(metric: Metric) -> tuple[str, ...]:
 
 
 def has_region(name: str) -> bool:
-    """Return whether a metric can be that of some photosites."""
+    """Return whether a metric can be computed for some of the photosites."""
     return not {"sites", "region"}.isdisjoint(options_of(METRICS.find("metric", name)))
 
 

@@ -24,7 +24,7 @@ CHUNK = 1 << 16
 METADATA_BYTES = 1 << 16
 #: Size limit of the table of milliseconds: times of more than a day indicate times since an epoch, not since the start.
 MAX_MS = 100_000_000
-#: Limits of decompressed data: per byte of the file, the maximum ratio of deflate, and in total.
+#: Limits of decompressed data: the maximum compression ratio of deflate, per byte of the file, and a number of bytes in all.
 MAX_DECOMPRESSION_RATIO, MAX_DECOMPRESSED_BYTES = 1032, 8 * 2**30
 #: Kinds of numeric columns, and of strings, which are stored as bytes.
 NUMBERS, STRINGS = "biuf", "US"
@@ -99,14 +99,14 @@ class EventFile:
         }
         for name in KINDS:
             _append(self._file[f"events/{name}"], values[name])
-        # Milliseconds that begin after the previous events.
+        # Index of the first event of each millisecond that has begun since the previous events.
         for begin in range(self._n_ms, n_ms, CHUNK):
             begins_us = 1000 * np.arange(begin, min(begin + CHUNK, n_ms))
             _append(self._file["ms_to_idx"], self.n_events + np.searchsorted(t_us, begins_us))
         self.n_events, self._n_ms = self.n_events + t_us.size, n_ms
 
     def finish(self) -> None:
-        """Write the entry of the table of milliseconds after the last event."""
+        """Close the table of milliseconds with the number of events."""
         _append(self._file["ms_to_idx"], np.array([self.n_events]))
 
 

@@ -23,7 +23,7 @@ __all__ = ["Between", "Exposure", "Shutter"]
 
 #: Irradiance between frames: constant until the next frame, or linear interpolation.
 Between = Literal["hold", "linear"]
-#: Tolerance for rounding of times, in frames: an exposure that ends later than a frame by less ends with it.
+#: Rounding tolerance in frames: an exposure that ends less than this after a frame is regarded as ending with the frame.
 TIME_ROUNDING = 1e-9
 
 

@@ -1,9 +1,10 @@
 """
 PSFs that vary over the field, as a sum of modes.
 
-The PSFs h at points of the field are ``h(x) = h̄ + Σ_k w_k(x) u_k``: the mean, and the singular vectors u of the deviations with
-their weights w at the points, interpolated between them. The map of a source S is then ``h̄ ∗ S + Σ_k u_k ∗ (w_k S)``: one more
-forward transform per mode, and one inverse transform. The modes have a sum of 0, so that power is exact for any number of them.
+The PSF at the point x of the field is ``h(x) = h̄ + Σ_k w_k(x) u_k``: h̄ is the mean PSF, u_k are the singular vectors of the
+deviations from it, and w_k their weights, interpolated between the points at which PSFs are computed. The map of a source S is
+then ``h̄ ∗ S + Σ_k u_k ∗ (w_k S)``, which takes one more forward transform per mode, and one inverse transform in all. Each u_k
+has the sum 0, so that the power is exact for any number of modes.
 
 Sources: T. R. Lauer, Deconvolution with a spatially-variant PSF, Proc. SPIE 4847, 167 (2002); R. C. Flicker and F. J. Rigaut,
 Anisoplanatic deconvolution of adaptive optics images, J. Opt. Soc. Am. A 22, 504 (2005); L. Denis et al., Fast approximations
@@ -26,18 +27,19 @@ from foveasim._core.validation import Floats, as_numbers, frozen_array
 from foveasim.fields import Grid
 from foveasim.optics._aperture import PSFModel, overlaps
 
-#: Points along each side of the picture at which PSFs are computed: the first number that reaches the tolerance.
+#: Numbers of points along each side of the picture at which PSFs are computed; the first that reaches the tolerance is used.
 FIELD_POINTS = (9, 17)
-#: Radius beyond the geometric blur, in λN, in which PSFs are compared: all but 1 % of the power of a clear circle.
+#: PSFs are compared up to this radius beyond the geometric blur, in λN, which contains 99 % of the power of a clear circle.
 REACH_LAMBDA_N = 20.0
 #: Largest number of wavelengths whose PSFs determine the modes.
 MAX_WAVELENGTHS = 3
-#: Largest number of samples of all PSFs, 1 GiB in single precision: more wavelengths than one, and more points, are omitted
-#: beyond it. Up to the second number, they are in double precision.
+#: Largest number of samples of all PSFs, 1 GiB in single precision: fewer wavelengths, and fewer points, are used so as not to
+#: exceed it. Largest number in double precision.
 MAX_SAMPLES, MAX_DOUBLE_SAMPLES = 1 << 28, 1 << 22
-#: Largest number of samples across the aperture, a blur of 24 λN, for more points: a first frame of some 30 s.
+#: Largest number of samples across the aperture (a blur of 24 λN) for the larger number of points: the first frame then takes
+#: some 30 s.
 MAX_ACROSS = 384
-#: If the tolerance cannot be reached, the modes displace this multiple of the least possible.
+#: If no number of modes reaches the tolerance, the modes may displace this multiple of the least possible fraction.
 UNREACHED = 1.02
 #: Samples whose products are computed in double precision together.
 SAMPLES_TOGETHER = 1 << 16
@@ -62,7 +64,7 @@ class FieldWeight:
 
 def field_weights(at_points: Floats, shape: tuple[int, int], degree: int = 3) -> list[FieldWeight]:
     """Return splines through values (m, n, n) at equidistant points of a picture."""
-    # Local functions along y: the spline through unit values at one point does not vanish between the others.
+    # B-splines along y are local. A spline through 1 at one point and 0 at all others is not: it is nowhere 0 in between.
     along_y, coefficients = splines(at_points.shape[1], (np.arange(shape[0]) + 0.5) / shape[0], degree)
     along_x = interpolation(at_points.shape[2], (np.arange(shape[1]) + 0.5) / shape[1], degree)
     # Not as matrix products: the threads of BLAS would compete with ours.
@@ -80,11 +82,13 @@ class FieldModes:
     points_um : (n_point, 2) float64, µm
         x and y of the points, row by row from the bottom.
     combinations : (n_mode, n_point) float64
-        Each mode as a sum of the PSFs at the points: that of the mean first, all others with the sum 0.
+        Coefficients of each mode as a sum of the PSFs at the points. The first mode is the mean; the coefficients of each
+        other mode have the sum 0.
     at_points : (n_mode, n, n) float64
         Weights of the modes at the points.
     singular_values : (n_point - 1,) float64
-        Those of the deviations from the mean PSF, sampled at λN/2, over the root of the number of wavelengths; descending.
+        Singular values of the deviations from the mean PSF, sampled at λN/2, divided by the square root of the number of
+        wavelengths; descending.
     displaced : float
         Largest fraction of the light of a point that the modes displace, at the points and between them.
     """
@@ -103,7 +107,7 @@ class FieldModes:
 
     @property
     def n_modes(self) -> int:
-        """Number of modes, that of the mean included."""
+        """Number of modes, including the mean."""
         return len(self.combinations)
 
     def weights(self, shape: tuple[int, int]) -> list[FieldWeight]:
@@ -124,7 +128,7 @@ def splines(n_points: int, at: Floats, degree: int = 3) -> tuple[Floats, Floats]
 
 
 def interpolation(n_points: int, at: Floats, degree: int = 3) -> Floats:
-    """Return the matrix (n, n_points) of splines through equidistant points from 0 to 1."""
+    """Return the matrix (n, n_points) that interpolates values at equidistant points."""
     along, coefficients = splines(n_points, at, degree)
     return np.einsum("nk,kp->np", along, coefficients)
 
@@ -148,9 +152,10 @@ def find_modes(
     """
     Return the modes of the PSFs over the field of a picture, a grid of map cells.
 
-    ``n_modes``: number without the mean; by default the smallest with which at most the fraction ``tolerance`` of the light is
-    displaced: half the L1 norm of the difference of the PSFs, in cells if these are wider than λN/2, at the points and midway
-    between them. There are more points if the fraction cannot be reached otherwise.
+    ``n_modes``: number of modes besides the mean; by default the smallest number that displaces at most the fraction
+    ``tolerance`` of the light. The displaced fraction is half the L1 norm of the difference between the PSF and its sum of
+    modes, evaluated at the points and midway between them. Cells wider than λN/2 are compared instead of samples. The larger
+    number of points is used only if the smaller does not reach the tolerance.
     """
     first_um = field_points_um(grid, FIELD_POINTS[0]).reshape(-1, 2)
     sampling = Sampling.of(aperture, first_um, wavelength_nm, lambda_n_um, grid.pitch_x_um)
@@ -178,11 +183,11 @@ def _modes_at(
     n_threads: int,
 ) -> FieldModes:
     """Return the modes of the PSFs at n x n points of a picture."""
-    every_um = field_points_um(grid, 2 * n_points - 1)
-    is_point, is_midway = (np.zeros(every_um.shape[:2], bool) for _ in range(2))
+    finer_um = field_points_um(grid, 2 * n_points - 1)
+    is_point, is_midway = (np.zeros(finer_um.shape[:2], bool) for _ in range(2))
     is_point[::2, ::2], is_midway[1::2, 1::2] = True, True
     used = is_point | is_midway
-    psfs = sampled_psfs(aperture, every_um[used], sampling, n_threads)
+    psfs = sampled_psfs(aperture, finer_um[used], sampling, n_threads)
     of_point = is_point[used]
     psfs -= psfs[of_point].mean(axis=0)
     at_points = psfs[of_point].reshape(n_points * n_points, -1)
@@ -197,7 +202,7 @@ def _modes_at(
     n_found, displaced = _number_of_modes(psfs, weights, modes, goal, n_most)
     n_all = n_points * n_points
     return FieldModes(
-        every_um[is_point],
+        finer_um[is_point],
         np.concatenate((np.full((1, n_all), 1.0 / n_all), fields[:n_found])),
         np.concatenate((np.ones((1, n_all)), fields[:n_found])).reshape(-1, n_points, n_points),
         sizes / math.sqrt(psfs.shape[1]),
@@ -209,8 +214,8 @@ def _singular_vectors(deviations: NDArray[Any]) -> tuple[Floats, Floats]:
     """
     Return the singular values and vectors of deviations from a mean.
 
-    (n_point - 1,) and (n_point - 1, n_point). There are far fewer points than samples: they are the eigenvectors of the
-    products, orthogonal to the mean.
+    Their shapes are (n_point - 1,) and (n_point - 1, n_point). There are far fewer points than samples, so they are computed
+    as eigenvectors of the scalar products of the points, orthogonal to the mean.
     """
     n_points, n_samples = deviations.shape
     products = np.zeros((n_points, n_points))
@@ -224,7 +229,7 @@ def _singular_vectors(deviations: NDArray[Any]) -> tuple[Floats, Floats]:
 
 
 def everywhere(fields: Floats) -> Floats:
-    """Return values (..., n, n) also midway, (..., 2n - 1, 2n - 1)."""
+    """Interpolate values (..., n, n) midway between the points: (..., 2n - 1, 2n - 1)."""
     n_points = fields.shape[-1]
     along = interpolation(n_points, np.linspace(0.0, 1.0, 2 * n_points - 1))
     along[::2] = np.eye(n_points)
@@ -247,7 +252,7 @@ def _number_of_modes(
     """
     Return the smallest number of modes for a fraction of displaced light.
 
-    And the fraction that they displace. ``deviations`` from the mean PSF are overwritten.
+    Also returns the fraction that they displace. ``deviations`` from the mean PSF are overwritten.
     """
     displaced = _displaced(deviations)
     for k in range(n_most):
@@ -261,11 +266,12 @@ def _number_of_modes(
 @dataclass(frozen=True)
 class Sampling:
     """
-    Samples of PSFs at multiples of λN/2, or sums over cells that are wider.
+    Sampling of PSFs at multiples of λN/2, or by sums over map cells if these are wider.
 
-    They are in a square that contains the geometric blur. ``wavelength_nm``, ``lambda_n_um``: of the shortest, a middle and
-    the longest wavelength. ``radius``: multiples on each side of the centre. ``cell_um``: width of the cells of a map, which
-    does not resolve how light is distributed within them.
+    The samples cover a square that contains the geometric blur. ``wavelength_nm``, ``lambda_n_um``: at most three wavelengths
+    from the shortest to the longest, and λN of each. ``n_across``: number of samples across the aperture. ``radius``: number
+    of samples on each side of the centre. ``cell_um``: width of the cells of a map, which does not resolve how light is
+    distributed within them.
     """
 
     wavelength_nm: tuple[float, ...]
@@ -284,12 +290,14 @@ class Sampling:
         blur = max(aperture.blur_lambda_n(float(wave_nm), point) for wave_nm in waves_nm for point in points)
         n_across = max(aperture.n_across(float(wave_nm), point) for wave_nm in waves_nm for point in points)
         radius = min(math.ceil(2.0 * (blur + REACH_LAMBDA_N)), n_across - 1)
-        one = cls((0.0,), (float(lambda_n_um.max()),), n_across, radius, cell_um)
-        # At the points and midway between them.
-        n_waves = max(1, min(waves_nm.size, MAX_WAVELENGTHS, MAX_SAMPLES // (2 * one.n_samples * len(points))))
+        single = cls((0.0,), (float(lambda_n_um.max()),), n_across, radius, cell_um)
+        # Twice the points, because PSFs are also sampled midway between them.
+        n_waves = max(1, min(waves_nm.size, MAX_WAVELENGTHS, MAX_SAMPLES // (2 * single.n_samples * len(points))))
         chosen = np.linspace(0, waves_nm.size - 1, n_waves).round().astype(int) if n_waves > 1 else np.zeros(1, int)
         return replace(
-            one, wavelength_nm=tuple(waves_nm[chosen].tolist()), lambda_n_um=tuple(lambda_n_um[which[chosen]].tolist())
+            single,
+            wavelength_nm=tuple(waves_nm[chosen].tolist()),
+            lambda_n_um=tuple(lambda_n_um[which[chosen]].tolist()),
         )
 
     @property

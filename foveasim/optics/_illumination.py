@@ -40,8 +40,7 @@ class IlluminationTable:
     Notes
     -----
     The fraction is interpolated monotonically in the image height (F. N. Fritsch and J. Butland, A method for constructing
-    local monotone piecewise cubic interpolants, SIAM J. Sci. Stat. Comput. 5, 300, 1984), and is that at the last height beyond
-    it.
+    local monotone piecewise cubic interpolants, SIAM J. Sci. Stat. Comput. 5, 300, 1984), and constant beyond the last height.
 
     Examples
     --------

@@ -7,10 +7,10 @@ scene behind three colour filters, the maps are summed together: each basis imag
 maps and dropped. In other groups the spectra of all basis images are stored, and maps are computed when they are requested.
 Memory is therefore limited to one spectrum per map or basis image, the smaller number of the two, plus one, and to one map.
 
-Where aberrations differ over the field, the PSFs are a sum of modes, :mod:`foveasim.optics._field_modes`: a basis image times
-the weights of a mode is another basis image, and a wavelength of a mode another wavelength. Or the picture is divided into
-overlapping isoplanatic patches with linear weights, each with the PSF at its own centre (overlap-add), which interpolates the
-PSF linearly between patch centres.
+There are two methods for aberrations that vary over the field. In the first, the PSFs are a sum of modes
+(:mod:`foveasim.optics._field_modes`): each basis image times the weights of a mode is an additional basis image, and each
+wavelength of a mode an additional wavelength. In the second, the picture is divided into overlapping isoplanatic patches with
+linear weights, each with the PSF at its centre (overlap-add), so that the PSF is interpolated linearly between patch centres.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from foveasim.optics.otf import Tables
 #: Function of (first, last) that returns the rows ``first`` to ``last - 1`` of a map.
 MapRows = Callable[[int, int], NDArray[Any]]
 
-#: Callable of (weights of a sum, transform, tables) that returns the transfer function of a sum, cached or not.
+#: Callable of (weights of a sum, transform, tables) that returns the transfer function of a sum of OTFs, cached or not.
 FactorLookup = Callable[[Floats, Transform, Tables], Factor]
 #: Function of (first, last) that processes columns of spectra.
 Columns = Callable[[int, int], None]
-#: Callable of weights of a sum that returns its transfer function.
+#: Callable of the weights of a sum of OTFs that returns its transfer function.
 FactorOf = Callable[[Floats], Factor]
-#: Comparison of the PSFs of neighbouring patches: points along either axis, and margin in λN beyond the geometric blur.
+#: Comparison of the PSFs of neighbouring patches: number of points along each axis, and margin beyond the blur in λN.
 COMPARISON_POINTS, COMPARISON_LAMBDA_N = 257, 5.0
 
 
@@ -69,8 +69,8 @@ class Group:
     """
     Maps and basis images that contribute to each other, and to no others.
 
-    ``basis``: (n_basis,). ``steps``: one step per basis image, to all maps, if there are more basis images than maps; else one
-    step for every n_basis maps, from all basis images.
+    ``basis`` (n_basis,): indices of the basis images. ``steps``: if there are more basis images than maps, one step per basis
+    image, which adds it to all maps; else one step per n_basis maps, which computes them from all basis images.
     """
 
     basis: Ints
@@ -87,20 +87,20 @@ class Imaging:
     """Inputs of the computation of power maps."""
 
     basis: Images
-    # On-axis irradiance in each band for an image value of 1, (n_basis, n_wavelength). With modes of the field, images are
-    # those of each mode times its weights, one after another, and wavelengths those of each mode.
+    # On-axis irradiance in each band for an image value of 1, (n_basis, n_wavelength). With modes of the field, each basis
+    # image has one row per mode, and each mode has its own columns, one per wavelength.
     irradiance_w_m2: Floats
     # Weights of the outputs, (n_output, n_wavelength).
     weights: Floats
-    # Weights of the modes but the mean over the field.
+    # Weights over the field of all modes except the mean PSF.
     field_weights: Sequence[FieldWeight]
-    # Relative illumination, in addition to the power of the cosine; none if it is 1.
+    # Factors of the relative illumination besides the power of the cosine; empty if it is 1.
     illumination: Sequence[FieldWeight]
     # Squared tangents of the angles to the axis, (n_x,) and (n_y,), and exponent of the cosine.
     tangent2_x: Floats
     tangent2_y: Floats
     falloff_power: int
-    # Images of the source pixels.
+    # Grid of the images of the source pixels.
     grid: Grid
     padding: str
     # Minimum number of padding cells on each side.
@@ -123,7 +123,7 @@ class Imaging:
         """Groups of maps, in the order of the first map of each."""
         n_outputs, n_basis = len(self.weights), len(self.irradiance_w_m2)
         is_needed = np.array([[bool(np.any(w * e)) for e in self.irradiance_w_m2] for w in self.weights], bool)
-        is_needed = is_needed.reshape(n_outputs, n_basis)  # without maps too
+        is_needed = is_needed.reshape(n_outputs, n_basis)  # also if there are no maps
         groups = []
         for outputs, basis in _connected(is_needed):
             if basis.size > outputs.size:
@@ -137,8 +137,8 @@ class Imaging:
         return tuple(groups)
 
     def _step(self, outputs: Ints, basis: Ints) -> Step:
-        """Return a pass with one sum of OTFs per wavelength, or per map and basis image."""
-        # The smaller number of the two.
+        """Return a step with one sum of OTFs per wavelength, or per map and basis image."""
+        # Whichever gives fewer sums.
         weights = self.weights[outputs, np.newaxis] * self.irradiance_w_m2[basis]
         is_used = weights.any(axis=(0, 1))
         is_needed = weights.any(axis=2)
@@ -149,12 +149,12 @@ class Imaging:
         return Step(outputs, basis, weights[is_needed], coefficients)
 
     def sums(self) -> list[Floats]:
-        """Return the wavelength weights of all required tables."""
+        """Return the wavelength weights of all different sums of OTFs."""
         found = {weight.tobytes(): weight for group in self.groups for step in group.steps for weight in step.weights}
         return list(found.values())
 
     def sources(self) -> tuple[Ints, Ints]:
-        """Return the picture rows and columns of the padded rows and columns; -1 for zero."""
+        """Return the picture row of each padded row, and the same for columns; -1: zero."""
         rows, columns = (source_pixels(n, self.padding, self.pad) for n in self.grid.shape)
         return rows, columns
 
@@ -180,6 +180,7 @@ class Imaging:
         write_spectrum: Callable[[int, NDArray[Any], Columns | None], None],
         factor_of: FactorOf,
     ) -> Iterator[MapRows]:
+        """Yield maps from the spectra of basis images, which ``write_spectrum`` computes."""
         stored: dict[Group, NDArray[Any]] = {}
 
         def filtering(spectra: NDArray[Any], step: Step, sums: NDArray[Any], **position: bool) -> Columns:
@@ -205,7 +206,7 @@ class Imaging:
                     write_spectrum(int(b), spectrum, None)
             is_last = step is group.steps[-1]
             spectra = stored.pop(group) if is_last else stored[group]
-            # The last maps replace the spectra.
+            # The last maps overwrite the spectra, which are no longer needed.
             is_replaced = is_last and spectra.shape[1:] == transform.spectrum_shape
             sums = spectra[: step.outputs.size] if is_replaced else transform.sums(step.outputs.size)
             transform.for_each_block_of_columns(filtering(spectra, step, sums, is_first=True, is_last=True))
@@ -239,7 +240,7 @@ class Imaging:
         ]
 
     def patch_cells(self, rows: PatchExtent, columns: PatchExtent) -> tuple[Any, Any]:
-        """Return the indices of the cells of a patch in the map, and those among its own cells."""
+        """Return the indices of the cells of a patch in the map, and of these within the patch."""
         k = self.oversample
         fine = [(k * extent.cells[:, np.newaxis] + np.arange(k)).ravel() for extent in (rows, columns)]
         is_inside = [(cells >= 0) & (cells < k * n) for cells, n in zip(fine, self.grid.shape, strict=True)]
@@ -361,7 +362,7 @@ def isoplanatic_error(
 
 
 def _nodes_um(grid: Grid, n_patches: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Return patch centres along y and x from the centre of the grid, from edge to edge."""
+    """Return patch centres along y and x, from edge to edge, relative to the grid's centre."""
     y, x = (
         np.linspace(-0.5, 0.5, n) * size * grid.pitch_x_um if n > 1 else np.zeros(1)
         for n, size in zip(n_patches, grid.shape, strict=True)

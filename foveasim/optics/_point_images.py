@@ -1,7 +1,8 @@
 """
 Point images: PSF, OTF, encircled and ensquared energy.
 
-A clear circular pupil in focus uses closed forms; every other aperture is integrated, and sampled for the energy.
+A clear circular pupil in focus has closed forms. For all other apertures, the PSF and the OTF are integrated over the pupil,
+and the encircled and ensquared energy are computed from a sampled pupil.
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ from foveasim.optics.otf import circular_otf
 
 #: Default number of PSF samples along either axis, and their pitch in λN.
 PSF_POINTS, PSF_LAMBDA_N = 257, 0.125
-#: Minimum number of samples across the aperture for encircled and ensquared energy; halves the error of power maps.
+#: Minimum number of samples across the aperture for encircled and ensquared energy, with half the error of power maps.
 POINT_ACROSS = 384
-#: The same for the OTF of an aperture that cannot be integrated.
+#: Minimum number of samples across an aperture that cannot be integrated, for the OTF.
 OTF_ACROSS = 768
-#: Radial and angular quadratures of the ensquared energy: minimum number of nodes, additional ones per λN of the
-#: side, and of which the number is a multiple, so that sides share nodes.
+#: Radial and angular quadratures of the ensquared energy: minimum number of nodes, and additional nodes per λN of the side. The
+#: number is rounded up to a multiple of the third value, so that squares of similar sides share nodes.
 QUADRATURE_NODES, NODES_PER_LAMBDA_N, NODES_STEP = 64, 8, 32
 #: Side (λN) above which the asymptotic PSF gives the ensquared energy to 1e-5.
 MIN_ASYMPTOTIC_SIDE = 100.0
-#: Largest circle or square (λN) for a sampled pupil, whose PSF repeats at eight times this distance.
+#: Largest circle or square (λN) for a sampled pupil, whose PSF is periodic with eight times this size.
 MAX_EXTENT = 256.0
 
 
@@ -235,8 +236,9 @@ class PointImages:
         -----
         Each frequency is a quadrature as for :meth:`psf`, over the overlap of two displaced copies of the pupil (Hopkins, Proc.
         R. Soc. A 231 (1955) 91), with an error below 1e-6; it takes 1 to 6 ms, 25 ms for the largest aberrations, or 30 ms for
-        a picture of 64 x 64 pixels. Pictures of more than 128 x 128 pixels (with those of a wavefront, together), computations
-        of more than 2^27 nodes, and callables with discontinuities at unspecified edges are sampled, with an error up to 1e-3.
+        an aperture given as a picture of 64 x 64 pixels. Apertures given as pictures of more than 128 x 128 pixels (counted
+        together with a picture of the wavefront), computations of more than 2^27 nodes, and callables with discontinuities at
+        unspecified edges are sampled, with an error up to 1e-3.
         """
         point = self._point(wavelength_nm, distance_m, field_um)
         s = finite_array("frequency_per_mm", frequency_per_mm) * 1e-3 * point.lambda_n_um

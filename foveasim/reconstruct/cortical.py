@@ -115,7 +115,7 @@ class CorticalImage:
 
     @property
     def ring_centre_um(self) -> Floats:
-        """Radius of the centre line of each ring, (n_ring,) µm, in the logarithm."""
+        """Radius midway between the circles of each ring in log(r + offset_um), (n_ring,) µm."""
         shifted = self.radius_um + self.offset_um
         return np.sqrt(shifted[1:] * shifted[:-1]) - self.offset_um
 
@@ -190,7 +190,8 @@ def cortical(layout: Layout, values: ArrayLike) -> CorticalImage:
     step_rad = 2.0 * math.pi / n_sectors
     xy_um = layout.centroid_um[sites] - centre_um
     angle_rad = np.arctan2(xy_um[..., 1], xy_um[..., 0])
-    # In sectors, relative to the outermost ring; the first ring may have corners of a fovea, which move its centroids.
+    # Angle of each centroid minus that of its sector if all rings were aligned with the outermost, in sectors. The first ring
+    # may have corners of a fovea, which move its centroids.
     first_rad = float(angle_rad[-1, 0]) - 0.5 * step_rad
     lead = (angle_rad - first_rad) / step_rad - (np.arange(n_sectors) + 0.5)
     lead = (lead - lead[:, :1] + 0.5 * n_sectors) % n_sectors - 0.5 * n_sectors + lead[:, :1]
@@ -295,8 +296,8 @@ def from_cortical(image: CorticalImage, grid: Grid, *, method: Literal["linear",
     grid : Grid
         Pixels of the picture; values are those at the pixel centres.
     method : {"linear", "nearest"}
-        Interpolation between the pixels of the image. ``"nearest"`` gives the value of the pixel, as of the site, in which a
-        point lies.
+        Interpolation between the pixels of the image. ``"nearest"`` gives the value of the pixel (or site) that contains a
+        point.
 
     Returns
     -------

@@ -1,8 +1,8 @@
 """
 Interpolation of photosite values between site centroids.
 
-Both methods are exact at the centroids. The coverage is that of the site outlines, without the gaps between neighbours, and not
-of the triangles between centroids, so that a blind spot remains without data.
+Both methods are exact at the centroids. The coverage of the picture is that of the site outlines, not of the triangles between
+centroids, so that a blind spot remains without data.
 """
 
 from __future__ import annotations

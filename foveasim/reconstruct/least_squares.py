@@ -31,7 +31,7 @@ __all__ = ["least_squares"]
 MIN_RASTER_FRACTION = 1e-6
 #: Relative tolerance of the misfit, compared with the noise, in the discrepancy rule.
 MISFIT_TOLERANCE = 0.02
-#: Largest number of regularisation strengths that are tried, and ratio of the first guess to the smallest strength.
+#: Largest number of regularisation strengths that are tried, and ratio of the first strength to the smallest.
 MAX_STRENGTHS, MAX_STRENGTH_RATIO = 12, 1e8
 #: Largest strength, as a multiple of the largest curvature of the data term: beyond it the picture is constant.
 MAX_RELATIVE_STRENGTH = 1e6
@@ -176,11 +176,11 @@ def least_squares(
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """
-    Least-squares problem of one channel, in units of its noise.
+    Least-squares problem of one channel, with values in units of their noise.
 
     ``overlaps`` (n_value, n_pixel), sparse: contribution of each pixel to each value, divided by the noise of the value.
     ``right`` (n_value,): values divided by their noise. ``weights`` (along x, along y): of the squared differences of
-    neighbours, 1 for square pixels. ``transfer`` (n_y, n_x // 2 + 1): transfer function of the blur.
+    neighbours, 1 for square pixels. ``transfer`` (n_y, n_x // 2 + 1): transfer function of the blur, None without.
     """
 
     overlaps: Any
@@ -279,15 +279,15 @@ class _Problem:
     def roughness(self, x: Floats) -> float:
         """Return the weighted sum of the squared differences of neighbouring pixels."""
         picture, (weight_x, weight_y) = x.reshape(self.shape), self.weights
-        across, along = (np.diff(picture, axis=1) ** 2).sum(), (np.diff(picture, axis=0) ** 2).sum()
-        return float(weight_y * along + weight_x * across)
+        along_x, along_y = (np.diff(picture, axis=1) ** 2).sum(), (np.diff(picture, axis=0) ** 2).sum()
+        return float(weight_y * along_y + weight_x * along_x)
 
     @cached_property
     def natural_strength(self) -> float:
         """
-        Number of values over the roughness of the first guess.
+        Strength of the rule ``"roughness"``: number of values over that of the first guess.
 
-        For uniform pictures the largest strength.
+        For a uniform first guess, which has no roughness, it is the largest strength.
         """
         return self.right.size / max(
             self.roughness(self.first_guess), self.right.size / (MAX_RELATIVE_STRENGTH * float(self._row_sums.max()))

@@ -42,9 +42,9 @@ __all__ = ["Picture", "raster_grid"]
 
 #: Pixels along the longer side of a picture.
 PIXELS = Limits(at_least=1, at_most=2**15)
-#: Coverage below this fraction, and lack of coverage below that one, are rounding errors.
+#: Coverage below the first fraction, and missing coverage below the second, are rounding errors.
 NO_COVERAGE, COMPLETE = 1e-9, 1e-6
-#: Layouts with cached parts, up to 200 bytes per site: the number of them with up to a number of sites.
+#: Caches of results for layouts, up to 200 bytes per site: number of layouts in each cache, and their largest number of sites.
 MAX_CACHED: tuple[tuple[int, int], ...] = ((2, 1 << 18), (1, 1 << 20))
 #: Whether gaps between neighbours, such as trenches, are drawn.
 Gaps: TypeAlias = Literal["fill", "empty"]
@@ -339,7 +339,7 @@ class Raster(NamedTuple):
 
     ``sites``: integrator of the photosites. ``drawn``: that of the outlines in the picture, without gaps between neighbours
     if these are filled. ``covered_um2`` (n_y, n_x): area of the drawn outlines in each pixel. ``covered_fraction``
-    (n_y, n_x): fraction of each pixel.
+    (n_y, n_x): the same as a fraction of the pixel.
     """
 
     sites: Integrator
@@ -368,9 +368,9 @@ def cached_by_layout(make: Callable[..., _Made]) -> Callable[..., _Made]:
 
     def cached(layout: PackedRings, *values: Any) -> _Made:
         if isinstance(layout, Layout):  # immutable
-            for max_sites, found in caches:
+            for max_sites, cached_make in caches:
                 if layout.n_sites <= max_sites:
-                    return found(layout, *values)
+                    return cached_make(layout, *values)
         return make(layout, *values)
 
     return cached

@@ -127,8 +127,8 @@ def blur_kernel(
         radii = np.arange(1, MAX_RADIUS + 1)
         energy = optics.encircled_energy((radii + 0.5) * shorter_um, wavelength_nm, distance_m=distance_m)
         radius = int(radii[min(int(np.searchsorted(energy, DEFAULT_ENERGY_FRACTION)), MAX_RADIUS - 1)])
-    finest_um = 8.0 * SAMPLE_LAMBDA_N * optics.psf(wavelength_nm, distance_m=distance_m, n_points=1).grid.pitch_x_um
-    step_um = shorter_um / (int(np.ceil(shorter_um / finest_um)) | 1)
+    coarsest_um = 8.0 * SAMPLE_LAMBDA_N * optics.psf(wavelength_nm, distance_m=distance_m, n_points=1).grid.pitch_x_um
+    step_um = shorter_um / (int(np.ceil(shorter_um / coarsest_um)) | 1)
     n_points = int(np.ceil((2 * radius + 3) * max(grid.pitch_x_um, grid.pitch_y_um) / step_um - 1e-9)) | 1
     if n_points > MAX_SAMPLES:
         raise ParameterError(

@@ -1,4 +1,4 @@
-"""Colorimetry: tristimulus values, linear sRGB, CIELAB, and the colours of the chart."""
+"""Colorimetry: tristimulus values, linear sRGB, CIELAB, and a chart of 24 patches."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _srgb_primaries() -> Floats:
     return np.asarray(np.linalg.solve(xyz[:3].T, xyz[3])[:, np.newaxis] * xyz[:3])
 
 
-#: Tristimulus values of linear red, green and blue, one per row; those of white.
+#: Tristimulus values of linear red, green and blue, one primary per row, and of white.
 XYZ_OF_SRGB = _srgb_primaries()
 WHITE_XYZ = XYZ_OF_SRGB.sum(axis=0)
 #: Luminance of linear red, green and blue, rounded as in Rec. ITU-R BT.709.
@@ -76,7 +76,7 @@ def patch_colours(illumination: Floats, wavelength_nm: Floats, band_width_nm: Fl
     """
     Return linear sRGB (24, 3) of the patches under an illumination (n_wavelength,).
 
-    None when it lacks one of the three tristimulus values.
+    Returns None when a tristimulus value of the illumination is 0: there is no white to adapt to.
     """
     patches, white = (
         tristimulus(illumination * part, wavelength_nm, band_width_nm)

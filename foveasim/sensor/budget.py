@@ -103,17 +103,17 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: Annotated[fl
     NoiseBudget
         A dict of (n_site,) float64, e-. Entries by name: :data:`TEMPORAL`, further temporal effects of the sensor,
         :data:`FIXED`, further fixed effects; 0 for effects that the sensor does not have. Noise is referred to the charge at
-        the sense node, after effects that mix sites, by the slope of the complete chain at the site's mean; so is conversion
-        noise: 1/12 DN² and differential nonlinearity.
+        the sense node, after effects that mix sites, by the slope of the complete chain at the site's mean. This includes the
+        noise of the conversion: quantisation (1/12 DN²) and differential nonlinearity.
 
     Notes
     -----
-    Temporal entries are those of this device. The variance of the collection is divided between ``photon_shot`` and
+    Temporal entries are for this device. The variance of the collection is divided between ``photon_shot`` and
     ``dark_shot`` by the mean charges of light and dark signal. Without clipping, the squares of the temporal entries add up to
     the variance of :meth:`foveasim.Sensor.predict`, referred to the charge.
 
-    Fixed entries are standard deviations over all devices of the kind, at their mean: the sum of squares is the variance of a
-    site's mean over devices, to first order. Crosstalk and inter-pixel capacitance reduce them, as they mix sites.
+    Fixed entries are standard deviations over devices of the same kind, to first order: the sum of their squares is the
+    variance of a site's mean value from device to device. Crosstalk and inter-pixel capacitance reduce them, as they mix sites.
 
     Examples
     --------
@@ -127,13 +127,13 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: Annotated[fl
     rates = check_per_site(
         "photo_e_per_s", finite_array("photo_e_per_s", photo_e_per_s, at_least=0.0), sensor.layout.n_sites
     )
-    known, of_devices = (
+    this_device, all_devices = (
         sensor.linearise(photo_e_per_s=rates, exposure_s=exposure_s, is_device_known=is_known)
         for is_known in (True, False)
     )
     noise_e = dict.fromkeys((*TEMPORAL, *FIXED), np.zeros(1))
     temporal = list(TEMPORAL)
-    for model, is_temporal in ((known, True), (of_devices, False)):
+    for model, is_temporal in ((this_device, True), (all_devices, False)):
         names = [name for name, kind in model.sources.items() if (kind != "fixed") is is_temporal]
         if not sensor.collection.is_drawn and is_temporal:
             names.remove(sensor.collection.name)  # rounding to whole electrons

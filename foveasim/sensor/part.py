@@ -1,4 +1,4 @@
-"""Some of the sites of a sensor, with the fixed patterns of the complete one."""
+"""Some of the sites of a sensor, with the fixed patterns of the complete sensor."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def part_of(sensor: Sensor, selection: slice | Ints) -> SensorPart:
 
 
 def _check_local(sensor: Sensor) -> None:
-    """Raise when effects connect sites with others."""
+    """Raise a ParameterError when effects connect sites, because a part lacks some of them."""
     connecting = ", ".join(repr(effect.name) for effect in sensor.chain if effect.reach == "all")
     if connecting:
         raise ParameterError(

@@ -22,7 +22,7 @@ from foveasim.units import ELEMENTARY_CHARGE_C
 
 #: Standard errors by which sample means may differ.
 SIGMAS = 5.0
-#: Sites, and frames (temporal effects) or devices (fixed patterns).
+#: Rows and columns of sites; number of frames (temporal effects) or devices (fixed patterns).
 SHAPE, N_DRAWS = (60, 100), 24
 N = SHAPE[0] * SHAPE[1]
 PHOTO_E, EXPOSURE_S = 5000.0, 0.5
@@ -104,8 +104,8 @@ def check_sensor_effect(name: str, keywords: Mapping[str, Any]) -> None:
 def _sensor(keywords: Mapping[str, Any]) -> Sensor:
     """Return a sensor of squares, each with its own readout line."""
     layout = grid(n_x=SHAPE[1], n_y=SHAPE[0], pitch_um=2.0).with_columns(readout_line=np.arange(N))
-    own = any(isinstance(effect, Collection) for effect in keywords.get("effects", ()))
-    return Sensor(layout, **{**FINE, **({"shot_noise": "auto"} if own else {}), **keywords})
+    has_collection = any(isinstance(effect, Collection) for effect in keywords.get("effects", ()))
+    return Sensor(layout, **{**FINE, **({"shot_noise": "auto"} if has_collection else {}), **keywords})
 
 
 def _expected_e(sensor: Sensor) -> Floats:

@@ -20,7 +20,7 @@ from foveasim.testing._extension import Extension, check_of, require
 
 #: Tolerances of coordinates, µm, and of relative values in files.
 POSITION_UM, RELATIVE = 1e-3, 1e-6
-#: Fractions of a file that truncated files have.
+#: Fractions of the complete file that remain in truncated files.
 TRUNCATED = (0.3, 0.7)
 
 Reader = Callable[..., Any]
@@ -123,8 +123,10 @@ def _psf_difference(found: PSFGrid, expected: PSFGrid) -> str:
         return "returns other wavelengths or another distance of the samples"
     if found.samples != expected.samples:
         return f"returns samples={found.samples!r}, expected {expected.samples!r}"
-    one, other = found.relative_illumination, expected.relative_illumination
-    if (one is None) != (other is None) or (one is not None and other is not None and not np.allclose(one, other)):
+    read, stored = found.relative_illumination, expected.relative_illumination
+    if (read is None) != (stored is None) or (
+        read is not None and stored is not None and not np.allclose(read, stored)
+    ):
         return "returns another relative illumination"
     return ""
 

@@ -100,7 +100,7 @@ def _check_power(pupil: Any, fraction: float) -> None:
 
 @check_of(LENSES)
 def check_lens(extension: Extension) -> None:
-    """Check that the directions of a lens model are inverse and do not fold the image."""
+    """Check that distort() and undistort() are inverse, and do not fold the image."""
     lens = extension.make()
     require(isinstance(lens, Lens), "must have focal_um, centre_um, distort() and undistort()")
     extension.check_dataclass(lens)

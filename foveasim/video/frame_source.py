@@ -206,7 +206,7 @@ class FrameSource:
             **self._scene,
         )
         basis = np.broadcast_to(converted.basis, (n_basis, *converted.basis.shape[1:]))
-        # The field of view is that of each frame, whatever its number of pixels.
+        # With a field of view, the pitch follows from the number of pixels of each frame.
         pitch_um = template.pitch_um if template.field_of_view_deg is None else None
         return replace(template, basis=basis, source=converted.source, pitch_um=pitch_um)
 

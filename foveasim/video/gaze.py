@@ -87,7 +87,7 @@ class GazePath:
         Parameters
         ----------
         path : path
-            UTF-8 text with the columns ``t_s``, ``x_um`` and ``y_um``, which its first line names; others are ignored.
+            UTF-8 text whose first line names the columns. ``t_s``, ``x_um`` and ``y_um`` are read, others are ignored.
 
         Raises
         ------
@@ -244,17 +244,17 @@ def saccades(
     xy_um = np.zeros((n, 2))
     begin_s, position_um = 0.0, np.zeros(2)
     while begin_s < t_s[-1] or begin_s == 0.0:
-        rest_duration_s = fixation_s * max(fixations.gamma(FIXATION_SHAPE) / FIXATION_SHAPE, MIN_FIXATION)
-        leave_s = begin_s + rest_duration_s
+        stay_s = fixation_s * max(fixations.gamma(FIXATION_SHAPE) / FIXATION_SHAPE, MIN_FIXATION)
+        leave_s = begin_s + stay_s
         fixation_slice = slice(*np.searchsorted(t_s, (begin_s, leave_s)))
         drift_um = np.cumsum(steps_um[fixation_slice], axis=0) - steps_um[fixation_slice][:1]
         xy_um[fixation_slice] = position_um + drift_um
-        left_um = xy_um[fixation_slice][-1] if fixation_slice.start < fixation_slice.stop else position_um
+        start_um = xy_um[fixation_slice][-1] if fixation_slice.start < fixation_slice.stop else position_um
         position_um = half_um * (2.0 * targets.random(2) - 1.0)
         begin_s = leave_s + saccade_s
         saccade_slice = slice(*np.searchsorted(t_s, (leave_s, begin_s)))
         u = ((t_s[saccade_slice] - leave_s) / max(saccade_s, frame_s))[:, np.newaxis]
-        xy_um[saccade_slice] = left_um + (position_um - left_um) * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
+        xy_um[saccade_slice] = start_um + (position_um - start_um) * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
     return GazePath(np.asarray(t_s), xy_um)
 
 

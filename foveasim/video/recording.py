@@ -50,7 +50,7 @@ LAYOUT_ARRAYS = ("xy_um", "ring_offsets", "site_offsets")
 FRAME_ARRAYS = ("code", "exposure_s", "gaze_um", "next_path", "frame")
 #: Fill value of frame numbers, for incomplete frames.
 NO_FRAME = -1
-#: Digest of the rest of a gaze path that ends, or of frames without a path.
+#: Digest of the rest of a gaze path where it ends, and in frames without a path.
 NO_PATH = bytes(DIGEST_BYTES).hex()
 #: Settings that may always differ between captures of one recording.
 FRAME_SETTINGS = frozenset(

@@ -1,9 +1,9 @@
 """
 Pictures of photosites with area-correct pixels.
 
-A pixel shows the mean over its area: of the values on a colour scale, which are mapped to a colour afterwards, and otherwise of
-the colours in linear light. Sites far smaller than a pixel therefore neither alias nor introduce colours that the colour map
-does not have.
+A pixel shows the mean over its area. Values on a colour scale are averaged and then mapped to a colour; all other colours are
+averaged in linear light. Sites far smaller than a pixel therefore neither alias nor introduce colours that the colour map does
+not have.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = ["SiteMeans", "cover", "picture_colours", "site_picture"]
 PIXELS_PER_BAND = 2**22
 #: Fractions of a pixel up to this are rounding errors.
 ROUNDING = 1e-9
-#: Filters of a colour capture at least, and colours of its picture.
+#: Smallest number of filters of a colour capture, and number of colour channels of its picture.
 N_COLOURS = 3
 
 
@@ -122,7 +122,7 @@ class _Band:
         if has_data.all():
             picture[..., :3] = colours.scale.colours(self.means(colours.values))
             return
-        # Pixels with and without data: the colour of the mean of the data, and that of no data, by their areas.
+        # A pixel that is partly without data mixes the colour of the mean value with that of missing data, by area.
         with_data, values = self.means(np.stack((has_data, np.where(has_data, colours.values, 0.0))))
         shown = colours.scale.colours(values / np.where(with_data > 0.0, with_data, np.inf))
         fraction = with_data[..., np.newaxis]

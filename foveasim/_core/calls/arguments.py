@@ -1,10 +1,10 @@
 """
 Messages for calls with wrong arguments.
 
-Python reports a misspelt, missing or surplus argument as a TypeError, and a value of another type somewhere inside the
-function, or not at all. Public functions, constructors and methods raise an :class:`~foveasim.errors.ArgumentError` instead,
-with the signature of the call and the closest name, and a :class:`~foveasim.errors.ParameterError` for values of other kinds
-than those of the annotations. Signatures, types and docstrings are those of the original function.
+Python reports a misspelt, missing or surplus argument as a TypeError, and a value of a wrong type only where the function
+uses it, or not at all. Public functions, constructors and methods raise an :class:`~foveasim.errors.ArgumentError` instead,
+with the signature of the call and the closest name, and a :class:`~foveasim.errors.ParameterError` for values that do not
+match the annotations. Checked functions keep their signature, types and docstring.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ R = TypeVar("R")
 MAX_SIGNATURE = 150
 #: Characters of a default in a signature.
 MAX_DEFAULT = 12
-#: Parameters that Python passes.
+#: First parameters of methods, which Python passes.
 BOUND = ("self", "cls")
-#: Kinds of the parameters of a call by position and by name, of other positional and of other named arguments.
+#: Accepted kinds of values: of parameters by position, of parameters by name, of ``*args``, and of ``**kwargs``.
 _Kinds = tuple[list[tuple[str, Kind | None]], dict[str, Kind | None], tuple[str, Kind] | None, Kind | None]
 #: Converters of parameters with declared limits, by position and by name.
 _Converters = tuple[list[tuple[int, str, Converter]], dict[str, Converter]]
-#: Modules whose functions check their arguments only in calls from outside the package: within it, they are called many times
-#: per capture, with what was checked where the call of a user enters.
+#: Modules whose functions check their arguments only in calls from outside the package. The package calls them many times
+#: per capture, with arguments that a public function has already checked.
 INNER = ("foveasim.optics._optics", "foveasim.sensor.effects.contract", "foveasim.units")
-#: Attribute of checked functions.
+#: Attribute that marks a function whose arguments are checked.
 CHECKED = "_arguments_are_checked"
 
 
@@ -51,7 +51,7 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
     """
     if not isinstance(call, FunctionType) or hasattr(call, CHECKED):
         return call
-    # Not globals of the function below.
+    # Local names, because the function below runs with the globals of ``call``, which lack these functions.
     find_problem, find_checks, check = _find_problem, _find_checks, check_kind
     frame, is_inner = sys._getframe, call.__module__ in INNER and call.__name__ != "__init__"  # noqa: SLF001 -- as in logging
     kinds: _Kinds | None = None
@@ -66,17 +66,17 @@ def check_arguments(call: Callable[P, R], *, converts: bool = True) -> Callable[
         if kinds is None:
             found, found_converters = find_checks(call, annotations)
             converters = found_converters if converts else converters
-            kinds = found  # last: another thread then has the converters, too
-        by_position, by_name, rest, every = kinds
+            kinds = found  # set last, so that other threads that see the kinds also see the converters
+        by_position, by_name, of_args, of_kwargs = kinds
         for (name, kind), value in zip(by_position, args):  # noqa: B905 -- surplus arguments are reported below
             if kind is not None and not kind.accepts(value):
                 check(name, value, kind)
-        if rest is not None:
+        if of_args is not None:
             for k, value in enumerate(args[len(by_position) :]):
-                if not rest[1].accepts(value):
-                    check(f"{rest[0]}[{k}]", value, rest[1])
+                if not of_args[1].accepts(value):
+                    check(f"{of_args[0]}[{k}]", value, of_args[1])
         for name, value in kwargs.items():
-            kind = by_name.get(name, every)
+            kind = by_name.get(name, of_kwargs)
             if kind is not None and not kind.accepts(value):
                 check(name, value, kind)
         for k, name, convert in converters[0]:
@@ -108,14 +108,14 @@ def _find_checks(call: Callable[..., Any], annotations: Mapping[str, Any]) -> tu
     by_position: list[tuple[str, Kind | None]] = []
     by_name: dict[str, Kind | None] = {}
     converters: _Converters = [], {}
-    rest, every = None, None
+    of_args, of_kwargs = None, None
     for k, (name, parameter) in enumerate(inspect.signature(call).parameters.items()):
         annotation = resolve_annotation(annotations.get(name, Any), names)
         known = None if k == 0 and name in BOUND else kind_of(annotation)
         if parameter.kind is parameter.VAR_KEYWORD:
-            every = known
+            of_kwargs = known
         elif parameter.kind is parameter.VAR_POSITIONAL:
-            rest = None if known is None else (name, known)
+            of_args = None if known is None else (name, known)
         else:
             declared = Declaration.of(annotation)
             convert = None if declared.limits is None else declared.converter
@@ -126,7 +126,7 @@ def _find_checks(call: Callable[..., Any], annotations: Mapping[str, Any]) -> tu
                 by_position.append((name, known))
                 if convert is not None:
                     converters[0].append((k, name, convert))
-    return (by_position, by_name, rest, every), converters
+    return (by_position, by_name, of_args, of_kwargs), converters
 
 
 def check_public_calls(module_name: str) -> None:
@@ -143,7 +143,7 @@ def check_public_calls(module_name: str) -> None:
             continue
         if isinstance(item, FunctionType):
             checked = check_arguments(item)
-            # In the module that defines it, too, where pickle looks it up.
+            # Also in the module that defines the function, where pickle looks it up.
             for home in (module, sys.modules[item.__module__]):
                 if vars(home).get(name) is item:
                     setattr(home, name, checked)
@@ -167,9 +167,9 @@ def _check_methods(kind: type) -> None:
 
 def _find_problem(call: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> ArgumentError | None:
     """Return the error of arguments that do not match a signature, None if they do."""
-    every = list(inspect.signature(call).parameters.values())
-    is_bound = bool(every) and every[0].name in BOUND and "." in call.__qualname__
-    parameters = every[1:] if is_bound else every
+    declared = list(inspect.signature(call).parameters.values())
+    is_bound = bool(declared) and declared[0].name in BOUND and "." in call.__qualname__
+    parameters = declared[1:] if is_bound else declared
     name = _name_of(call, args[:is_bound])
     args = args[1:] if is_bound else args
     shown = _format_signature(name, parameters)
@@ -201,7 +201,7 @@ def _is_required(parameter: inspect.Parameter) -> bool:
 
 
 def _name_of(call: Callable[..., Any], owner: tuple[Any, ...]) -> str:
-    """Return the name as in a call: ``function``, ``Class``, ``Class.method``."""
+    """Return the name as users write it: ``function``, ``Class`` or ``Class.method``."""
     if owner and call.__name__ != "__init__":  # inherited methods have the name of the object's class
         kind = owner[0] if isinstance(owner[0], type) else type(owner[0])
         return f"{kind.__name__}.{call.__name__}"

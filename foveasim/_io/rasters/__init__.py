@@ -1,8 +1,8 @@
 """
 Images of spectral bands in files of other programs.
 
-Size limits, reading in the sandbox process, and common parts of formats: EXR, MAT, netCDF, zarr, units. Power maps
-(:mod:`foveasim.maps`) and hyperspectral cubes (:mod:`foveasim.scene.cubes`) are read with it.
+Size limits, reading in the sandbox process, and the parts of EXR, MAT, netCDF, zarr and units that the readers of power maps
+(:mod:`foveasim.maps`) and of hyperspectral cubes (:mod:`foveasim.scene.cubes`) share.
 """
 
 from __future__ import annotations

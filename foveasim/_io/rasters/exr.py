@@ -17,7 +17,7 @@ from foveasim._io.rasters import MAX_BANDS, check_size
 from foveasim._io.rasters.units import length_in_um, round_factor
 
 MAGIC = b"\x76\x2f\x31\x01"
-#: Channel of a band: optional layer, wavelength and unit. A layer is not a number: ``550.5nm`` has none.
+#: Channel name of a band: optional layer, wavelength and unit. Layers are not numbers: ``550.5nm`` is one wavelength.
 CHANNEL = re.compile(
     r"(?:(?P<layer>S[0-3]|T|.*[^0-9.].*)\.)?(?P<number>[0-9]+(?:[.,][0-9]+)?(?:[eE][-+]?[0-9]+)?)(?P<unit>[a-zµ]{1,2})"
 )
@@ -60,7 +60,7 @@ def read_header(path: Path) -> ExrHeader:
 
 def band_of_channel(name: str) -> tuple[str, float] | None:
     """
-    Return layer and wavelength of a channel, nm; None without wavelength.
+    Return the layer and the wavelength in nm of a channel; None without a wavelength.
 
     Examples
     --------

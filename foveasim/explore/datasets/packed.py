@@ -92,8 +92,8 @@ class PackedBoxes:
 
     def __getitem__(self, k: int) -> tuple[Floats, Ints]:
         """Return the boxes (n_box, 4) of a picture in pixels, and their classes (n_box,)."""
-        own = slice(self._offsets[k], self._offsets[k + 1])
-        return self._boxes_px[own], self._classes[own]
+        of_picture = slice(self._offsets[k], self._offsets[k + 1])
+        return self._boxes_px[of_picture], self._classes[of_picture]
 
     def arrays(self) -> tuple[Any, ...]:
         """Return all arrays, for a checksum."""

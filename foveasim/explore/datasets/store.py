@@ -35,12 +35,12 @@ __all__ = ["StoredSamples", "open_dataset", "write_dataset"]
 
 FORMAT = "foveasim dataset"
 ZARR, ABOUT = ".zarr", "dataset.json"
-#: Default size of a shard: approximate bytes and largest number of samples. One process has a shard in memory.
+#: Default size of a shard: approximate bytes and largest number of samples. Each process has one shard in memory.
 SHARD_BYTES, MAX_SHARD_SAMPLES = 1 << 26, 512
-#: Smallest default number of shards: many processes can write, and an interruption loses little.
+#: Smallest default number of shards, so that many processes can write, and an interruption loses little.
 MIN_SHARDS = 32
-#: Smallest default number of samples of a shard, which precedes the number of shards: few files for small datasets. Larger
-#: shards have a multiple of it, so that zarr chunks of 2, 4 or 8 samples divide them.
+#: Smallest default number of samples of a shard, even if there are then fewer shards: small datasets have few files. Larger
+#: shards have a multiple of this number, so that zarr chunks of 2, 4 or 8 samples divide them.
 MIN_SHARD_SAMPLES = 8
 #: Name of the array with the digest of each complete shard.
 DONE = "done"
@@ -80,9 +80,9 @@ def write_dataset(
     per_shard : int, optional
         Number of samples per shard; by default 1/32 of the dataset, from 8 to 512 samples, and at most about 64 MiB.
     workers : int, optional
-        Number of processes; 1 and 0 are this process. Others import the main file of the calling program: call this function
-        under ``if __name__ == "__main__":``. None: one process per core, as soon as the estimated remaining time in this
-        process exceeds 10 s.
+        Number of processes; 1 and 0 are this process. Other processes import the main file of the calling program: call this
+        function under ``if __name__ == "__main__":``. None: one process per core, as soon as the estimated remaining time in
+        this process exceeds 10 s.
     scheduler : str, optional
         Address of a dask scheduler instead, such as ``"tcp://10.0.0.1:8786"``. Its workers need this package, and access to
         the pictures and ``path`` under the same names.
@@ -193,8 +193,8 @@ def _write_shards(
     if progress is not None:
         progress(n_done, n)
     with closing(_write_each(dataset, shards, missing, scheduler, workers)) as results:
-        for k, (n_own, own) in results:
-            n_warnings, first_warning = n_warnings + n_own, min(first_warning or own, own or first_warning)
+        for k, (n_in_shard, first) in results:
+            n_warnings, first_warning = n_warnings + n_in_shard, min(first_warning or first, first or first_warning)
             n_done += len(shards.samples(k))
             if progress is not None:
                 progress(n_done, n)
@@ -231,7 +231,7 @@ def _write_each(
 
 
 class _Warnings(NamedTuple):
-    """Number of the samples of a shard with warnings, and the first in alphabetical order."""
+    """Number of samples of a shard that have warnings, and the alphabetically first warning."""
 
     n: int
     first: str
@@ -572,7 +572,7 @@ class _ZarrShards(_Shards):
         return self._opened[1]
 
     def _rows(self) -> dict[str, RowReader]:
-        """Return the reader of each array; they do not depend on the process."""
+        """Return the reader of each array; forked processes can use it, too."""
         if self._readers is None:
             try:
                 arrays = self._arrays()

@@ -142,10 +142,15 @@ def _rename_dimensions(
         new_names: dict[str, str] = {}
         for dim in first.dims:
             new_name = dim if dim in first.labels or dim.startswith(name) else f"{name}_{dim}"
-            others = {*reserved, *values_by_name, *new_names.values(), *(() if new_name in first.labels else labelled)}
-            if new_name in others:
+            used_names = {
+                *reserved,
+                *values_by_name,
+                *new_names.values(),
+                *(() if new_name in first.labels else labelled),
+            }
+            if new_name in used_names:
                 new_name = f"{name}_{dim}"
-            while new_name in others:
+            while new_name in used_names:
                 new_name += "_"
             new_names[dim] = new_name
         for k, value in values.items():
@@ -273,7 +278,7 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
         # For xarray.open_zarr. The warning concerns other zarr implementations, which do not need consolidated metadata.
         warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")
         dataset.to_zarr(new, mode="w", consolidated=True, zarr_format=3)
-        # Synchronised to disk before the journal is removed: after a power failure one of them is complete.
+        # The store is on disk before the journal is removed: after a power failure, one of both is complete.
         for file in (path for path in new.rglob("*") if path.is_file()):
             with file.open("r+b") as opened:
                 os.fsync(opened.fileno())

@@ -206,6 +206,7 @@ def _run(
     users = list(plan.metrics.values())
     points, changes = plan.order()
     is_pending = np.array([int(point) not in known for point in points])
+    # Positions among the pending points at which the layout or the optical image changes.
     cuts = (np.cumsum(is_pending) - is_pending)[changes]
     try:
         with executor(

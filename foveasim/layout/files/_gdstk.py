@@ -27,7 +27,7 @@ MAX_COPY_RATIO = 2
 NUMBER_PROPERTY, COLUMNS_PROPERTY = 1, 2
 UNDIVIDED = re.compile(r"^photosite ([0-9]{1,9})\0*$", re.MULTILINE)
 NUMBER = re.compile(r"photosite ([0-9]{1,9})(?: part ([0-9]{1,9}) of ([0-9]{1,9}))?\0*")
-#: Numbers of the sites of an array: that of its first site, steps from column to column and row to row, columns and rows.
+#: Numbers of the sites of an array: number of the first site, steps from column to column and from row to row, columns, rows.
 NUMBERS = re.compile(
     r"photosites ([0-9]{1,9})(?:([+-][0-9]{1,9})i)?(?:([+-][0-9]{1,9})j)? of ([0-9]{1,9})x([0-9]{1,9})\0*"
 )
@@ -68,12 +68,16 @@ class Shapes(NamedTuple):
     def place_sites(
         self, matrix: NDArray[np.float64], offsets: NDArray[np.float64], identity: NDArray[np.int64]
     ) -> Shapes:
-        """Return copies that are sites: photosite, line and index in the array, (n, 3)."""
+        """
+        Return copies each of which is one site.
+
+        ``identity`` (n, 3): photosite, line of its columns and index in its array, of each copy.
+        """
         copies = self.place(matrix, offsets)
         copies.tags[:, 5] = 0
-        own = np.repeat(identity, len(self.tags), axis=0)
-        copies.tags[:, 2] = np.where(copies.tags[:, 2] < 0, -1, own[:, 0])
-        copies.tags[:, 6:8] = own[:, 1:]
+        of_shape = np.repeat(identity, len(self.tags), axis=0)
+        copies.tags[:, 2] = np.where(copies.tags[:, 2] < 0, -1, of_shape[:, 0])
+        copies.tags[:, 6:8] = of_shape[:, 1:]
         return copies._replace(n_placements=0)
 
     def is_site(self) -> bool:
@@ -130,8 +134,8 @@ def read(
     layers = _layers_of_sites(found, layers, filters)
     is_site = {key for key in found if _last_match(key, layers) >= 0}
     filter_of = {key: k for key in found if (k := _last_match(key, filters)) >= 0}
-    own = {name: _Selected(cells[name], is_site, filter_of) for name in order}
-    _check_numbers(cells, order, own, max_sites, max_memory_bytes)
+    selected = {name: _Selected(cells[name], is_site, filter_of) for name in order}
+    _check_numbers(cells, order, selected, max_sites, max_memory_bytes)
     # Memory and time of the following steps are bounded.
     limit("RLIMIT_AS", max_memory_bytes)
     limit("RLIMIT_CPU", max_cpu_s)
@@ -139,7 +143,7 @@ def read(
     lines: list[str] = []
     last_use = {child: name for name in order for child in _children(cells, name)}
     for name in order:
-        flat[name] = _flatten(cells[name], own.pop(name), flat, lines, library.unit * 1e6, dbu_um)
+        flat[name] = _flatten(cells[name], selected.pop(name), flat, lines, library.unit * 1e6, dbu_um)
         for child in _children(cells, name):
             if last_use[child] == name:
                 del flat[child]
@@ -185,8 +189,8 @@ def _layers_of_sites(
     """
     Return the layers of the photosites.
 
-    By default these are the layers of the shapes with numbers of photosites, or the only layer with shapes except those of
-    filters; if all shapes are those of filters, they are the photosites.
+    By default these are the layers of the shapes with numbers of photosites, or the only layer with shapes besides the filters.
+    If all shapes are on the layers of filters, these are the layers of the photosites.
     """
     if wanted is not None:
         for number, kind in wanted:
@@ -324,7 +328,7 @@ class _Selected:
 
 
 def _check_numbers(
-    cells: dict[str, Any], order: list[str], own: dict[str, _Selected], max_sites: int, max_memory_bytes: int
+    cells: dict[str, Any], order: list[str], selected: dict[str, _Selected], max_sites: int, max_memory_bytes: int
 ) -> None:
     """Reject a hierarchy that would flatten to too many sites or too much memory or time."""
     n_polygons: dict[str, int] = {}
@@ -333,11 +337,11 @@ def _check_numbers(
     n_copied = 0
     for name in order:
         references = [(r.cell_name, _n_copies(r)) for r in cells[name].references]
-        n_polygons[name] = own[name].count_polygons() + sum(k * n_polygons[c] for c, k in references)
+        n_polygons[name] = selected[name].count_polygons() + sum(k * n_polygons[c] for c, k in references)
         n_copied += n_polygons[name]
         if n_polygons[name] > max_sites or n_copied > MAX_COPY_RATIO * max_sites:
             raise FormatError(f"has more than the maximum of {max_sites} sites")
-        n_vertices[name] = own[name].count_vertices(max_vertices) + sum(k * n_vertices[c] for c, k in references)
+        n_vertices[name] = selected[name].count_vertices(max_vertices) + sum(k * n_vertices[c] for c, k in references)
         if VERTEX_BYTES * n_vertices[name] + POLYGON_BYTES * n_polygons[name] > max_memory_bytes:
             raise FormatError(
                 f"has more than the maximum for a file of its size: {n_polygons[name]} sites and filters with "
@@ -365,14 +369,14 @@ def _format_names(names: Iterable[str]) -> str:
 
 
 def _flatten(
-    cell: Any, own: _Selected, flat: dict[str, Shapes], lines: list[str], unit_um: float, dbu_um: float
+    cell: Any, selected: _Selected, flat: dict[str, Shapes], lines: list[str], unit_um: float, dbu_um: float
 ) -> Shapes:
     """
     Return the polygons of a cell and its hierarchy, in database units.
 
     The column strings of the polygons and of numbered references are appended to ``lines``.
     """
-    parts = [_own_shapes(own, lines, unit_um, dbu_um)]
+    parts = [_shapes_of_cell(selected, lines, unit_um, dbu_um)]
     n_placements = 1
     groups: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
     numbered: dict[tuple[Any, ...], tuple[list[NDArray[np.float64]], list[NDArray[np.int64]]]] = {}
@@ -457,18 +461,18 @@ def _rotation(angle_rad: float) -> NDArray[np.float64]:
     return np.array([[c, -s], [s, c]])
 
 
-def _own_shapes(own: _Selected, lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
+def _shapes_of_cell(selected: _Selected, lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
     """Return the polygons of one cell, with paths as polygons and repetitions expanded."""
-    polygons, filters = list(own.polygons), list(own.filters)
-    for i, n in enumerate(own.copies):
+    polygons, filters = list(selected.polygons), list(selected.filters)
+    for i, n in enumerate(selected.copies):
         if n > 1:
             # Copies are separate photosites, although they have the same number.
-            copies = own.polygons[i].apply_repetition()
+            copies = selected.polygons[i].apply_repetition()
             polygons += copies
             filters += [filters[i]] * len(copies)
-    outlines = own.outlines_of_paths()
+    outlines = selected.outlines_of_paths()
     polygons += outlines
-    filters += [own.filter_of.get((q.layer, q.datatype), -1) for q in outlines]
+    filters += [selected.filter_of.get((q.layer, q.datatype), -1) for q in outlines]
     points = [p.points for p in polygons]
     counts = np.fromiter(map(len, points), np.int64, len(points))
     xy = np.concatenate(points) if points else np.zeros((0, 2))
@@ -491,7 +495,7 @@ def _sites(polygons: list[Any]) -> Any:
     texts = [_property(p, NUMBER_PROPERTY) for p in polygons]
     known = [text for text in texts if text is not None]
     if len(known) == len(texts):
-        # A match per line, and no line break within a string.
+        # The fast way is right only if every string is one line, and every line matches.
         text = "\n".join(known)
         numbers = UNDIVIDED.findall(text)
         if len(numbers) == len(texts) == text.count("\n") + 1:
@@ -514,7 +518,7 @@ def _site(polygon: Any) -> tuple[int, int, int]:
 
 
 def _property(element: Any, attribute: int) -> str | None:
-    """Return a GDSII property, or None without one in UTF-8; gdstk returns others as bytes."""
+    """Return a GDSII property, or None if it is missing or not UTF-8 (bytes in gdstk)."""
     text = element.get_gds_property(attribute)
     return text if isinstance(text, str) else None
 

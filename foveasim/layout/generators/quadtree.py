@@ -82,7 +82,7 @@ def quadtree(
     Returns
     -------
     Layout
-        In the order of the rows of lower left corners, with the centre of the picture on the optical axis, and with the
+        Sites row by row in the order of their lower left corners, with the centre of the picture on the optical axis, and the
         columns ``level`` (number of subdivisions), ``row`` and ``column`` (of the lower left corner, in pixels) and
         ``readout_line`` (the column).
 

@@ -25,11 +25,11 @@ from foveasim.errors import ParameterError, SamplingWarning, warn
 
 #: Largest number of values: 2 GiB in double precision.
 MAX_VALUES = 1 << 28
-#: Largest number of values of PSFs that are turned, of which finer samples are stored.
+#: Largest number of values of PSFs on a radius: they are rotated around the axis, for which finer samples are stored.
 MAX_TURNED_VALUES = 1 << 24
 #: Largest number of field points and of samples along a side.
 MAX_POINTS, MAX_SIDE = 4096, 8192
-#: Relative tolerance of equal coordinates, over the extent of the field.
+#: Largest difference of equal coordinates, as a fraction of the extent of the field.
 SAME = 1e-6
 #: Fraction of the light beyond the window of a PSF above which a warning is issued.
 MAX_BEYOND = 0.05
@@ -46,18 +46,18 @@ class PSFGrid:
     ----------
     psf : (n_point, n_wavelength, n_y, n_x) float32 or float64
         Irradiance around the image point, row 0 lowest, with odd numbers of rows and columns: the image point is the centre
-        of the middle sample. Each is divided by its sum.
+        of the middle sample. Each PSF is divided by its sum.
     x_um, y_um : (n_point,) float64, µm
         Image points relative to the optical axis, in the upright picture. They form a rectangular grid, lie on one radius of
         a rotationally symmetric lens, or are one point, whose PSF is that of the whole field.
     wavelength_nm : (n_wavelength,) float64, nm
-        Ascending. Between two wavelengths the PSF is interpolated linearly, beyond the last it is that of the last.
+        Ascending. The PSF is interpolated linearly between wavelengths; beyond the outermost wavelength it is constant.
     pitch_um : float, µm
-        Distance of the samples.
+        Sampling pitch.
     samples : {"points", "bins"}
         Whether values are those at points, or means over squares around them, such as counts of rays.
     relative_illumination : (n_point, n_wavelength), optional
-        Irradiance of a uniform scene over that on the axis, in place of cos⁴; by default that of the lens.
+        Irradiance of a uniform scene relative to that on the axis, in place of cos⁴; by default that of the lens.
 
     Raises
     ------
@@ -71,10 +71,10 @@ class PSFGrid:
 
     Notes
     -----
-    Between the points, PSFs without the displacement of their centroids are interpolated, and displaced by interpolated
-    centroids: by cubic splines, or linearly if distances of points differ by more than a factor of 2. Those on a radius are
-    turned around the axis. Beyond the outermost points, the PSF is that of the nearest position within. Frequencies above the
-    cut-off of the lens, ``1 / λN``, are removed.
+    Between the points, the PSFs and their centroids are interpolated separately: the PSFs are centred on their centroids,
+    interpolated, and displaced by the interpolated centroid. The interpolation uses cubic splines, or is linear if distances
+    between points differ by more than a factor of 2. PSFs on a radius are rotated around the axis. Beyond the outermost points,
+    the PSF is that of the nearest position within. Frequencies above the cut-off of the lens, ``1 / λN``, are removed.
 
     Examples
     --------
@@ -157,13 +157,13 @@ class PSFGrid:
         Parameters
         ----------
         psf : (n_point, n_wavelength, n_y, n_x), (n_point, n_y, n_x) or (n_y, n_x) array
-            Without wavelengths, there is one; without points, there is one.
+            Three dimensions: PSFs of one wavelength. Two dimensions: one PSF.
         x_um, y_um : (n_point,) array or float, µm
             Image points relative to the optical axis, in any order.
         wavelength_nm : (n_wavelength,) array or float, nm
             In any order.
         pitch_um : float, µm
-            Distance of the samples.
+            Sampling pitch.
         image : {"upright", "inverted"}
             Whether positions are those in the upright picture, or those in the image that a lens projects, as in lens design.
             The latter are turned by 180°: ``h(-x, -y)`` at the field point ``(-x, -y)``.
@@ -344,7 +344,7 @@ def _check_shape(
         )
     if wavelength_nm.shape != (psf.shape[1],):
         raise ParameterError("wavelength_nm", f"must have {psf.shape[1]} values, one per PSF, got {wavelength_nm.size}")
-    # One more for the padding of even numbers.
+    # Even numbers of samples are padded by one.
     if psf.size > MAX_VALUES or psf.shape[0] > MAX_POINTS or max(psf.shape[2:]) > MAX_SIDE + 1:
         raise ParameterError(
             "psf",
@@ -388,7 +388,7 @@ def _normalised(psf: NDArray[Any], real: Any, x_um: Floats, y_um: Floats, wavele
                 f"{rule}, which that at ({x_um[point]:g}, {y_um[point]:g}) µm and {wavelength_nm[wave]:g} nm "
                 f"{'is not' if rule.endswith('finite') else 'does not'}",
             )
-    # Those of a file or another object are normalised already, and remain the same.
+    # PSFs from a file or another PSFGrid already have unit sum: their values must not change.
     is_one = np.abs(sums - 1.0) <= 8.0 * np.finfo(real).eps
     return np.ascontiguousarray(psf / np.where(is_one, 1.0, sums)[:, :, np.newaxis, np.newaxis], real)
 

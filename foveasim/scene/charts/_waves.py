@@ -13,13 +13,13 @@ from foveasim.scene.charts._canvas import HALF_TURN, Canvas, Pattern, Picture, c
 
 #: Limit of computing time: the sampled centre of a star with more sectors takes minutes.
 MAX_SPOKES = 1000
-#: Sectors wider than this, more than a pixel diagonal, have at most one edge within a pixel.
+#: A pixel contains at most one edge where sectors are wider than this, which is more than a pixel diagonal.
 MIN_SECTOR_PIXELS = 1.5
 #: Half the pixel diagonal, rounded up.
 HALF_DIAGONAL_PIXELS = 0.7072
 #: Amplitude of the wave that is clipped to a square wave; the value on an edge is 1/2.
 SQUARE_WAVE_AMPLITUDE = 1e9
-#: Points and weights of three-point Gauss-Legendre quadrature for means from -1/2 to 1/2.
+#: Points and weights of three-point Gauss-Legendre quadrature for means over the interval from -1/2 to 1/2.
 GAUSS = ((-0.5 * np.sqrt(0.6), 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.5 * np.sqrt(0.6), 5.0 / 18.0))
 
 

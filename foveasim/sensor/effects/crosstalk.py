@@ -133,8 +133,8 @@ class CrosstalkOperator:
         Returns
         -------
         variance : (..., n_site) float64
-            ``sum_i (matrix**n_steps)[j, i]**2 * variance[i]``, in the same unit. Several steps are multiplied for a part of the
-            sites at a time.
+            ``sum_i (matrix**n_steps)[j, i]**2 * variance[i]``, in the same unit. The matrix power is computed for a part of
+            the sites at a time.
         """
         values = check_per_site("variance", as_numbers("variance", variance), self.matrix.shape[0], or_rows=True)
         columns = np.moveaxis(np.asarray(values, np.float64), -1, 0)
@@ -162,8 +162,9 @@ class CrosstalkOperator:
         return self.matrix.power(2)
 
     def _row_blocks(self) -> Iterator[tuple[slice, csr_array[Any]]]:
-        """Yield sites and their rows of the power, in blocks for neighbours in two dimensions."""
+        """Yield blocks of sites, and their rows of the matrix power."""
         n_sites = self.matrix.shape[0]
+        # In two dimensions, the number of sites that charge reaches grows with the square of the number of steps.
         per_row = min(self.matrix.nnz / max(n_sites, 1) * self.n_steps**2, n_sites)
         step = max(1, int(MAX_ELEMENTS / max(per_row, 1.0)))
         for first in range(0, n_sites, step):
@@ -210,7 +211,7 @@ class Mixing(Effect):
     """
     Deterministic linear mixing of the values of sites, such as crosstalk.
 
-    Subclasses define :meth:`operator`. The stage is at most "charge".
+    Subclasses define :meth:`operator`. The stage is "charge" or an earlier one.
     """
 
     is_temporal: ClassVar[bool] = False
@@ -384,9 +385,9 @@ class KernelCrosstalk(_Crosstalk):
     Parameters
     ----------
     kernel : (n_row, n_column), odd numbers
-        Distribution of a unit charge at the central element: ``kernel[j, i]`` moves ``i - n_column // 2`` columns to the right
-        and ``j - n_row // 2`` rows **up**; row 0 is the lowest, as in all arrays of this package. The elements are
-        non-negative fractions with a sum of at most 1; the difference from 1 is lost in the silicon.
+        Distribution of the charge of the central element: the fraction ``kernel[j, i]`` moves ``i - n_column // 2`` columns to
+        the right and ``j - n_row // 2`` rows **up**; row 0 is the lowest, as in all arrays of this package. The elements are
+        non-negative with a sum of at most 1; the difference from 1 is lost in the silicon.
     border : {"kept", "lost"}
         Charge that would move to a position without a site remains in its site ("kept"), or is lost.
     pitch_um : number or (pitch_x, pitch_y), optional, µm
@@ -459,19 +460,19 @@ class KernelCrosstalk(_Crosstalk):
                 f"the layout is not a grid: site {duplicate} has the same position as another site; {_ALTERNATIVE}"
             )
         source, target, fraction = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
-        retained = np.zeros(n_sites)
+        without_target = np.zeros(n_sites)
         for j, i in np.argwhere(kernel > 0.0):
-            wanted_position = ordered + (j - half_y) * stride + (i - half_x)
-            at = np.minimum(np.searchsorted(ordered, wanted_position), max(n_sites - 1, 0))
-            is_there = ordered[at] == wanted_position
-            source.append(order[is_there])
-            target.append(order[at[is_there]])
+            target_position = ordered + (j - half_y) * stride + (i - half_x)
+            at = np.minimum(np.searchsorted(ordered, target_position), max(n_sites - 1, 0))
+            has_site = ordered[at] == target_position
+            source.append(order[has_site])
+            target.append(order[at[has_site]])
             fraction.append(np.full(source[-1].size, kernel[j, i]))
-            retained[order[~is_there]] += kernel[j, i]
+            without_target[order[~has_site]] += kernel[j, i]
         if self.border == "kept":
-            source.append(np.flatnonzero(retained))
+            source.append(np.flatnonzero(without_target))
             target.append(source[-1])
-            fraction.append(retained[source[-1]])
+            fraction.append(without_target[source[-1]])
         pairs = (np.concatenate(target).astype(np.int32), np.concatenate(source).astype(np.int32))
         return CrosstalkOperator(coo_array((np.concatenate(fraction), pairs), shape=(n_sites, n_sites)).tocsr())
 
@@ -631,11 +632,11 @@ def _exchange(shared_um: csr_array[Any], fraction: Floats) -> tuple[csr_array[An
     return matrix, loss, float(loss.max(initial=0.0))
 
 
-def _add_remainder(matrix: csr_array[Any], fraction: Floats, n_steps: int) -> csr_array[Any]:
+def _add_remainder(matrix: csr_array[Any], lost_fraction: Floats, n_steps: int) -> csr_array[Any]:
     """Return the matrix of one of several equal steps; the diagonal is the remaining fraction."""
     from scipy.sparse import csr_array, diags_array
 
-    return csr_array(matrix / n_steps + diags_array(1.0 - fraction / n_steps))
+    return csr_array(matrix / n_steps + diags_array(1.0 - lost_fraction / n_steps))
 
 
 def _grid_positions(layout: Photosites, pitch_um: Any) -> tuple[Ints, Ints]:
@@ -682,9 +683,9 @@ def _grid_positions(layout: Photosites, pitch_um: Any) -> tuple[Ints, Ints]:
 
 def _lines(position_um: Floats, same_um: float) -> tuple[Ints, Floats]:
     """
-    Return the line index of each site, and the ascending positions of the lines.
+    Return the line (row or column) of each site, and the ascending positions of the lines.
 
-    A line is a run of positions without gaps.
+    A line is a run of sorted positions without steps above ``same_um``.
     """
     order = np.argsort(position_um, kind="stable")
     rising_um = position_um[order]

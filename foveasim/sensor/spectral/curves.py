@@ -344,7 +344,7 @@ def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
     Raises CurveError if the function raises (its exception is the cause), or does not return one real number per wavelength.
     Raises ParameterError if a curve of this package rejects a wavelength.
     """
-    called = getattr(curve, "__qualname__", None) or type(curve).__qualname__
+    curve_name = getattr(curve, "__qualname__", None) or type(curve).__qualname__
     try:
         given = curve(wavelength_nm)
     except FoveasimError:
@@ -352,19 +352,21 @@ def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
     except Exception as error:
         problem = " ".join(f"{type(error).__name__}: {error}".split())
         raise CurveError(
-            "curve", f"must be a function of wavelength that returns numbers, but {called} raised {problem}"
+            "curve", f"must be a function of wavelength that returns numbers, but {curve_name} raised {problem}"
         ) from error
     try:
         values = np.asarray(given)
         if values.dtype.kind not in "biuf":
             raise TypeError
     except (TypeError, ValueError):
-        raise CurveError("curve", "must return one number per wavelength", given, hint=f"correct {called}") from None
+        raise CurveError(
+            "curve", "must return one number per wavelength", given, hint=f"correct {curve_name}"
+        ) from None
     if values.shape not in ((), np.shape(wavelength_nm)):
         raise CurveError(
             "curve",
             f"must return one number per wavelength, got the shape {values.shape} for {np.shape(wavelength_nm)}",
-            hint=f"correct {called}",
+            hint=f"correct {curve_name}",
         )
     return np.broadcast_to(values.astype(np.float64, copy=False), np.shape(wavelength_nm))
 

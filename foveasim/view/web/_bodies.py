@@ -35,7 +35,7 @@ def bodies_of(meshes: Sequence[Mesh], layout: Layout) -> tuple[dict[str, Any], d
     """
     Return surfaces as plain data and arrays for ``bodies.js``.
 
-    ``meshes``: closed surfaces of photosites of the layout; -1 for no photosite. Returns ``about``: ``lattice_um``,
+    ``meshes``: closed surfaces of photosites of the layout; photosite -1 stands for none. Returns ``about``: ``lattice_um``,
     ``origin_um``, the bounding box ``low_um`` and ``high_um``, and the ``list`` of surfaces. ``arrays``: ``position_x``,
     ``position_y``: lattice steps from one position to the next; ``positions``: position of each point, as back references;
     ``z``: height of each point on the lattice; ``run_sites``: site + 1 of each run of points, with ``run_points``,

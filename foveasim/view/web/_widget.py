@@ -1,4 +1,4 @@
-"""Widget with the page of a layout or capture, by anywidget; imported on use."""
+"""Notebook widget with the page of a layout or capture; imported on use, needs anywidget."""
 
 from __future__ import annotations
 
