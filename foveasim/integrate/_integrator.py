@@ -289,7 +289,9 @@ class Integrator:
         Returns
         -------
         weights : csr_array (n_site, n_y * n_x) float64, µm²
-            ``area(site ∩ cell)``; ``weights @ power_map.ravel()`` is ``integrator(power_map)``.
+            ``weights @ power_map.ravel()`` is ``integrator(power_map)``: at first order ``area(site ∩ cell)``, scaled for
+            ``conserve="density"`` and 0 for sites outside the image circle; at second order also weights of the neighbours of
+            boundary cells.
         """
         matrix = self._compiled.matrix() * self.grid.cell_area_um2
         if self._gain is not None:

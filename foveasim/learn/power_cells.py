@@ -399,4 +399,4 @@ def _check_partition(area_um2: Floats, region_um: Floats) -> None:
         not abs(float(area_um2.sum()) - total_um2) <= AREA_ROUNDING * total_um2
         or area_um2.min() < -AREA_ROUNDING * total_um2
     ):
-        raise GeometryError("the cells must be ones that float64 resolves; move the closest centres apart")
+        raise GeometryError("some cells are too small for float64; move the closest centres apart")

@@ -18,8 +18,8 @@ from foveasim.optics import PSF_FORMATS, PSFGrid, read_psfs
 from foveasim.scene import CUBE_FORMATS, Scene
 from foveasim.testing._extension import Extension, check_of, require
 
-#: Tolerances of coordinates, µm, and of relative values in files.
-POSITION_UM, RELATIVE = 1e-3, 1e-6
+#: Tolerances of coordinates, µm, and of relative values and areas in files.
+POSITION_UM, RELATIVE, AREA = 1e-3, 1e-6, 1e-3
 #: Fractions of the complete file that remain in truncated files.
 TRUNCATED = (0.3, 0.7)
 
@@ -47,7 +47,7 @@ def _layout_difference(found: object, expected: Layout) -> str:
     if away_um > POSITION_UM:
         return f"returns sites that are displaced by up to {away_um:.4g} µm; check units, orientation and order"
     error = np.abs(found.area_um2 / expected.area_um2 - 1.0).max()
-    return f"returns areas that differ by up to {error:.1%}" if error > POSITION_UM else ""
+    return f"returns areas that differ by up to {error:.1%}" if error > AREA else ""
 
 
 @check_of(MAP_FORMATS)

@@ -1145,7 +1145,9 @@ def test_changed_inputs_are_rejected(container, tmp_path):
     before = (target / "shard-000001.tar").read_bytes()
     other = make(changed)
 
-    with pytest.raises(FileError, match="is of other pictures, masks or flows: those of samples 2 to 3 have changed"):
+    with pytest.raises(
+        FileError, match="was written from other pictures, masks or flows: those of samples 2 to 3 have changed"
+    ):
         explore.write_dataset(other, target)
     assert (target / "shard-000001.tar").read_bytes() == before
     (target / "shard-000001.tar").unlink()

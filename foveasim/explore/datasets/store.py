@@ -185,8 +185,8 @@ def _write_shards(
             samples = shards.samples(k)
             raise FileError(
                 shards.directory,
-                f"is of other pictures, masks or flows: those of samples {samples[0]} to {samples[-1]} have changed; use "
-                "another path, or remove the existing dataset",
+                f"was written from other pictures, masks or flows: those of samples {samples[0]} to {samples[-1]} have "
+                "changed; use another path, or remove the existing dataset",
             )
     n, n_done = shards.n_samples, shards.n_samples - sum(len(shards.samples(k)) for k in missing)
     n_warnings, first_warning = 0, ""

@@ -355,7 +355,7 @@ def _check_shape(
         raise ParameterError(
             "psf",
             f"must have odd numbers of rows and columns, got {psf.shape[2:]}",
-            hint="use PSFGrid.from_arrays, which knows the centre of others",
+            hint="use PSFGrid.from_arrays for even numbers",
         )
 
 
@@ -385,8 +385,8 @@ def _normalised(psf: NDArray[Any], real: Any, x_um: Floats, y_um: Floats, wavele
             point, wave = np.argwhere(is_bad)[0]
             raise ParameterError(
                 "psf",
-                f"{rule}, which that at ({x_um[point]:g}, {y_um[point]:g}) µm and {wavelength_nm[wave]:g} nm "
-                f"{'is not' if rule.endswith('finite') else 'does not'}",
+                f"{rule}; the one at ({x_um[point]:g}, {y_um[point]:g}) µm and {wavelength_nm[wave]:g} nm "
+                f"{'is not' if rule.endswith('finite') else 'does not have one'}",
             )
     # PSFs from a file or another PSFGrid already have unit sum: their values must not change.
     is_one = np.abs(sums - 1.0) <= 8.0 * np.finfo(real).eps
