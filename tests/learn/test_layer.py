@@ -214,7 +214,7 @@ def test_gaze_agrees_with_camera(axis, gaze_cells, order, limit):
     original = camera(optics={"relative_illumination": even, "oversample": order}, axis=axis, order=order)
     layer = learn.SensorLayer(original, light, exposure_s=EXPOSURE_S)
     gaze_um = tuple((np.array(gaze_cells) * layer.model.grid.pitch_x_um).tolist())
-    expected_e = original.at(gaze_um, axis).capture(light, exposure_s=EXPOSURE_S, seed=0).expected_e
+    expected_e = original.with_gaze(gaze_um, axis).capture(light, exposure_s=EXPOSURE_S, seed=0).expected_e
     found = layer.expected_e(pictures_of(light)[None], torch.tensor([gaze_um], dtype=torch.float64))[0]
 
     np.testing.assert_allclose(found.numpy(), expected_e, rtol=0, atol=limit * expected_e.max())
