@@ -446,7 +446,7 @@ def write_tiles(
     target = Path(path)
     if target.suffix.lower() != ZARR:
         raise FileError(target, "must end in .zarr")
-    import_optional(target, "zarr")
+    zarr = import_optional(target, "zarr")
     start = partial(capture_tiles, camera, light, exposure_s=exposure_s, seed=seed, frame=frame, tile_sites=tile_sites)
     start()  # checks the arguments
     plan = _plan(camera, light, exposure_s, Streams(seed, frame), _whole_blocks(tile_sites))
@@ -469,8 +469,10 @@ def write_tiles(
 
             tiles = with_progress(tiles, "tiles", -(-layout.n_sites // plan["tile_sites"]), n_complete)
         try:
-            with _open(directory, "r+", is_finished=False) as group:
-                arrays = {name: group[name].with_config(ALL_CHUNKS) for name in (*_names(group), COMPLETE)}
+            # Arrays have the configuration that is set when they are opened.
+            configuration = zarr.config.set({f"array.{name}": value for name, value in ALL_CHUNKS.items()})
+            with configuration, _open(directory, "r+", is_finished=False) as group:
+                arrays = {name: group[name] for name in (*_names(group), COMPLETE)}
             for capture in tiles:
                 with disk_errors(target):
                     _add(arrays, n_complete, capture)
