@@ -11,17 +11,23 @@ from __future__ import annotations
 from foveasim._core.calls import publish
 from foveasim._core.registry import import_all
 from foveasim.distortion._brown_conrady import BrownConrady
-from foveasim.distortion._calibration import from_opencv, read_calibration, to_opencv
+from foveasim.distortion._calibration import from_opencv, to_opencv
+from foveasim.distortion._calibration_files import read_calibration
 from foveasim.distortion._fisheye import Fisheye, PolynomialFisheye, Scaramuzza
 from foveasim.distortion._lens import Lens
 from foveasim.distortion._map import distort_map
 from foveasim.distortion._registry import LENSES
+from foveasim.distortion._unified import DoubleSphere, ExtendedUnified, FieldOfView, Omnidirectional
 
 __all__ = [
     "LENSES",
     "BrownConrady",
+    "DoubleSphere",
+    "ExtendedUnified",
+    "FieldOfView",
     "Fisheye",
     "Lens",
+    "Omnidirectional",
     "PolynomialFisheye",
     "Scaramuzza",
     "distort_map",

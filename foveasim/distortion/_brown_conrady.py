@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from foveasim._core.calls import FINITE, OwnCheck
+from foveasim._core.calls import FINITE, Limits, OwnCheck
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Bools, Floats
@@ -22,6 +22,8 @@ N_DIRECTIONS = 720
 POINTS_PER_PIECE = 50_000
 #: Size of the table of start values for the inverse.
 START_POINTS = 4097
+#: Tilts of a sensor.
+TILT = Limits(at_least=-1.5, at_most=1.5, hint="tilts are in rad")
 #: Largest radius of the table of start values, in focal lengths: 89.4 degrees from the axis.
 MAX_RADIUS = 100.0
 
@@ -32,9 +34,9 @@ MAX_RADIUS = 100.0
 @dataclass(frozen=True, kw_only=True)
 class BrownConrady(LensBase):
     """
-    Radial and tangential distortion with up to eight coefficients.
+    Radial and tangential distortion, with thin prisms and a tilted sensor.
 
-    The model of Brown (1966), Eq. 6 of the paper; equal to OpenCV's model with up to eight coefficients.
+    The model of Brown (1966), Eq. 6 of the paper; equal to OpenCV's model with up to fourteen coefficients.
 
     Parameters
     ----------
@@ -47,6 +49,11 @@ class BrownConrady(LensBase):
     p1, p2 : float
         Tangential coefficients for y pointing **up**: the paper's r1 and r2. OpenCV's p1, for y pointing down, has the
         opposite sign.
+    s1, s2, s3, s4 : float
+        Coefficients of thin prisms along x (s1, s2) and y (s3, s4), for y pointing up: those of OpenCV with the opposite signs
+        of s3 and s4.
+    tau_x_rad, tau_y_rad : float, rad
+        Tilt of the sensor about x and y (Scheimpflug), for y pointing up: OpenCV's τx has the opposite sign.
     centre_um : (x, y), µm
         Intersection of the optical axis with the sensor plane.
 
@@ -59,10 +66,11 @@ class BrownConrady(LensBase):
     -----
     With the ideal position (x, y), its radius r and the radial factor R, all normalised by the focal length::
 
-        x_d = x R + 2 p1 x y + p2 (r² + 2 x²)
-        y_d = y R + 2 p2 x y + p1 (r² + 2 y²)
+        x_d = x R + 2 p1 x y + p2 (r² + 2 x²) + s1 r² + s2 r⁴
+        y_d = y R + 2 p2 x y + p1 (r² + 2 y²) + s3 r² + s4 r⁴
 
-    The model is invertible up to its fold, where the determinant of the Jacobian is 0. The inverse uses Newton's method.
+    A tilted sensor maps these points by the homography of Louhichi et al. (2007), as OpenCV does. The model is invertible up to
+    its fold, where the determinant of the Jacobian is 0. The inverse uses Newton's method.
 
     Examples
     --------
@@ -82,6 +90,12 @@ class BrownConrady(LensBase):
     k6: Annotated[float, FINITE] = 0.0
     p1: Annotated[float, FINITE] = 0.0
     p2: Annotated[float, FINITE] = 0.0
+    s1: Annotated[float, FINITE] = 0.0
+    s2: Annotated[float, FINITE] = 0.0
+    s3: Annotated[float, FINITE] = 0.0
+    s4: Annotated[float, FINITE] = 0.0
+    tau_x_rad: Annotated[float, TILT] = 0.0
+    tau_y_rad: Annotated[float, TILT] = 0.0
     centre_um: tuple[float, float] = (0.0, 0.0)
 
     __repr__ = short_repr
@@ -100,24 +114,38 @@ class BrownConrady(LensBase):
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
         factor, _ = self._radial(r2)
-        return np.stack(
+        flat = np.stack(
             (
-                x * factor + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x),
-                y * factor + 2.0 * self.p2 * x * y + self.p1 * (r2 + 2.0 * y * y),
+                x * factor + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x) + r2 * (self.s1 + self.s2 * r2),
+                y * factor + 2.0 * self.p2 * x * y + self.p1 * (r2 + 2.0 * y * y) + r2 * (self.s3 + self.s4 * r2),
             ),
             axis=1,
         )
+        return flat if self._tilt is None else _project(self._tilt, flat)
+
+    @cached_property
+    def _tilt(self) -> Floats | None:
+        """Homography of the tilted sensor, (3, 3); None without a tilt."""
+        if self.tau_x_rad == self.tau_y_rad == 0.0:
+            return None
+        (c_x, s_x), (c_y, s_y) = ((math.cos(tau), math.sin(tau)) for tau in (self.tau_x_rad, self.tau_y_rad))
+        about_x = np.array([[1.0, 0.0, 0.0], [0.0, c_x, s_x], [0.0, -s_x, c_x]])
+        turned = np.array([[c_y, 0.0, -s_y], [0.0, 1.0, 0.0], [s_y, 0.0, c_y]]) @ about_x
+        to_sensor = np.array([[turned[2, 2], 0.0, -turned[0, 2]], [0.0, turned[2, 2], -turned[1, 2]], [0.0, 0.0, 1.0]])
+        return to_sensor @ turned
 
     def _jacobian(self, xy: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return the derivatives of x_d and y_d with respect to x and y."""
+        """Return the derivatives of x_d and y_d, before the tilt, with respect to x and y."""
         x, y = xy[:, 0], xy[:, 1]
-        factor, slope = self._radial(x * x + y * y)
+        r2 = x * x + y * y
+        factor, slope = self._radial(r2)
         across = 2.0 * (x * y * slope + self.p1 * x + self.p2 * y)
+        prism_x, prism_y = 2.0 * (self.s1 + 2.0 * self.s2 * r2), 2.0 * (self.s3 + 2.0 * self.s4 * r2)
         return (
-            factor + 2.0 * x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x,
-            across,
-            across,
-            factor + 2.0 * y * y * slope + 2.0 * self.p2 * x + 6.0 * self.p1 * y,
+            factor + 2.0 * x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x + prism_x * x,
+            across + prism_x * y,
+            across + prism_y * x,
+            factor + 2.0 * y * y * slope + 2.0 * self.p2 * x + 6.0 * self.p1 * y + prism_y * y,
         )
 
     def _determinant(self, xy: Floats) -> Floats:
@@ -128,7 +156,7 @@ class BrownConrady(LensBase):
     def _fold(self) -> Floats:
         """Smallest ideal radius with determinant 0 per direction; infinite without a fold."""
         angle_rad = 2.0 * math.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
-        if self.p1 == self.p2 == 0.0:
+        if self.p1 == self.p2 == self.s1 == self.s2 == self.s3 == self.s4 == 0.0:
             return np.full(N_DIRECTIONS, self._radial_fold)
         # Along each direction the determinant times the fourth power of the denominator is a polynomial in the radius.
         c, s = np.cos(angle_rad)[:, np.newaxis], np.sin(angle_rad)[:, np.newaxis]
@@ -136,13 +164,18 @@ class BrownConrady(LensBase):
         plain = above * below
         # Products of the square of the denominator with r dR/dr, with r, and (above) with R.
         slope = (r * (above.deriv() * below - above * below.deriv())).coef
-        linear = (below * below * r).coef
-        size = max(slope.size, linear.size, plain.coef.size)
-        slope, linear, base = (np.pad(part, (0, size - part.size)) for part in (slope, linear, plain.coef))
-        xx = base + c * c * slope + linear * (2.0 * self.p1 * s + 6.0 * self.p2 * c)
-        yy = base + s * s * slope + linear * (2.0 * self.p2 * c + 6.0 * self.p1 * s)
-        xy = c * s * slope + linear * (2.0 * self.p1 * c + 2.0 * self.p2 * s)
-        product = [np.convolve(a, b) - np.convolve(d, d) for a, b, d in zip(xx, yy, xy, strict=True)]
+        linear, cubic = (below * below * r).coef, (below * below * r**3).coef
+        size = max(slope.size, cubic.size, plain.coef.size)
+        slope, linear, cubic, base = (
+            np.pad(part, (0, size - part.size)) for part in (slope, linear, cubic, plain.coef)
+        )
+        prism_x = 2.0 * self.s1 * linear + 4.0 * self.s2 * cubic
+        prism_y = 2.0 * self.s3 * linear + 4.0 * self.s4 * cubic
+        xx = base + c * c * slope + linear * (2.0 * self.p1 * s + 6.0 * self.p2 * c) + c * prism_x
+        yy = base + s * s * slope + linear * (2.0 * self.p2 * c + 6.0 * self.p1 * s) + s * prism_y
+        across = c * s * slope + linear * (2.0 * self.p1 * c + 2.0 * self.p2 * s)
+        parts = zip(xx, yy, across + s * prism_x, across + c * prism_y, strict=True)
+        product = [np.convolve(a, b) - np.convolve(d, e) for a, b, d, e in parts]
         return np.minimum(smallest_roots(np.array(product)), smallest_roots(below.coef)[0])
 
     def _parts(self) -> tuple[Any, Any, Any]:
@@ -171,7 +204,7 @@ class BrownConrady(LensBase):
             return math.inf, math.inf
         angle_rad = 2.0 * math.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
         boundary = ideal * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
-        return ideal, float(np.hypot(*self._map(boundary).T).min())
+        return ideal, float(np.nanmin(np.hypot(*self._map(boundary).T)))  # a tilted sensor has a horizon
 
     def _is_inside(self, xy: Floats) -> Bools:
         """Return whether points lie within the fold."""
@@ -187,8 +220,8 @@ class BrownConrady(LensBase):
     def _backward(self, xy: Floats) -> Floats:
         from foveasim.distortion import _kernels
 
-        points = np.ascontiguousarray(xy)
-        k = np.array([self.k1, self.k2, self.k3, self.k4, self.k5, self.k6])
+        points = np.ascontiguousarray(xy if self._tilt is None else _project(np.linalg.inv(self._tilt), xy))
+        k = np.array([self.k1, self.k2, self.k3, self.k4, self.k5, self.k6, self.s1, self.s2, self.s3, self.s4])
         inverse = _kernels.brown_conrady_inverse
         pieces = [points[i : i + POINTS_PER_PIECE] for i in range(0, max(len(points), 1), POINTS_PER_PIECE)]
         found = parallel_map(
@@ -209,3 +242,10 @@ class BrownConrady(LensBase):
         reach = np.maximum.accumulate(table * factor)
         ideal = np.interp(reach[-1] * np.linspace(0.0, 1.0, START_POINTS), reach, table)
         return np.minimum(ideal, 0.98 * end), (START_POINTS - 1) / float(reach[-1])
+
+
+def _project(homography: Floats, xy: Floats) -> Floats:
+    """Return points (n, 2) after a homography (3, 3); NaN behind its horizon."""
+    mapped = xy @ homography[:, :2].T + homography[:, 2]
+    depth = np.where(mapped[:, 2] > 0.0, mapped[:, 2], np.nan)
+    return np.asarray(mapped[:, :2] / depth[:, np.newaxis])

@@ -27,6 +27,8 @@ PROJECTIONS: dict[Projection, tuple[Callable[[Floats], Floats], Callable[[Floats
 }
 #: Points within this normalised radius are scaled linearly, which avoids a division by 0.
 MIN_RADIUS = 1e-12
+#: Largest number of coefficients of Scaramuzza's polynomial.
+MAX_COEFFICIENTS = 10
 #: Margin below 90° in radians, where the pinhole projection diverges.
 ANGLE_MARGIN_RAD = 1e-9
 
@@ -204,9 +206,10 @@ class Scaramuzza(_AngularLens):
 
     Parameters
     ----------
-    a : (4,), pixels
-        ``a0, a2, a3, a4`` of ``f(r) = a0 + a2 r² + a3 r³ + a4 r⁴``, r in pixels: the ray of the pixel at (x, y) has the
-        direction (x, y, f(r)). The signs of all coefficients are inverted if a0 is negative (axis pointing into the camera).
+    a : (n,), pixels
+        ``a0, a2, a3, ...`` of ``f(r) = a0 + a2 r² + a3 r³ + ...``, up to the tenth power, r in pixels: the ray of the pixel at
+        (x, y) has the direction (x, y, f(r)). The signs of all coefficients are inverted if a0 is negative (axis pointing into
+        the camera).
     pixel_um : float, µm
         Pixel size, the unit of the coefficients.
     focal_um : float, µm
@@ -243,8 +246,9 @@ class Scaramuzza(_AngularLens):
 
     def __post_init__(self) -> None:
         a = finite_array("a", self.a, ndim=1)
-        if a.shape != (4,) or a[0] == 0.0:
-            raise ParameterError("a", "must be four numbers a0, a2, a3, a4, a0 not 0", self.a)
+        if not 1 <= a.size <= MAX_COEFFICIENTS or a[0] == 0.0:
+            rule = f"must be 1 to {MAX_COEFFICIENTS} numbers a0, a2, a3, ..., a0 not 0"
+            raise ParameterError("a", rule, self.a)
         stretch = finite_array("stretch", self.stretch, ndim=2)
         if stretch.shape != (2, 2) or not np.linalg.det(stretch) > 0.0:
             raise ParameterError("stretch", "must be a 2 x 2 matrix with a positive determinant", self.stretch)
@@ -263,8 +267,8 @@ class Scaramuzza(_AngularLens):
     def _depth(self) -> np.polynomial.Polynomial:
         """Ray depth f(r) as a polynomial of the image height, both in focal lengths."""
         unit = self.pixel_um / self.focal_um
-        a0, a2, a3, a4 = self.a
-        return np.polynomial.Polynomial([a0 * unit, 0.0, a2 / unit, a3 / unit**2, a4 / unit**3])
+        first, *others = self.a
+        return np.polynomial.Polynomial([first * unit, 0.0, *(a / unit**k for k, a in enumerate(others, 1))])
 
     @cached_property
     def _max_height(self) -> float:

@@ -80,6 +80,8 @@ EDIT_FILE_ARGUMENTS: dict[str, dict[str, Any]] = {
 
 
 #: Position of all lens models; lengths in their examples are for a focal length of 60 µm.
+#: Models whose image height is a function of the angle, as that of ``fisheye``.
+AS_FISHEYE = ("double_sphere", "extended_unified", "field_of_view")
 LENS = {"focal_um": IMAGE_UM, "centre_um": CENTRE_UM}
 
 
@@ -182,7 +184,11 @@ def axes():
         },
         "distortion": {
             "none": {},
-            **{name: {"distortion": {"kind": name, **LENSES.example(name), **LENS}} for name in LENSES},
+            **{
+                name: {"distortion": {"kind": name, **example, **LENS}}
+                for name in LENSES
+                if name not in AS_FISHEYE and not callable(example := LENSES.example(name))  # files
+            },
         },
         "order": {"auto": {}, "1": {"integration_order": 1}, "2": {"integration_order": 2}},
         "layout": layouts(),

@@ -109,6 +109,8 @@ def public_objects(directory):
         optics.PupilImage(np.ones((64, 64))), optics.Seidel(coma_um=0.1), optics.Slit(0.1), optics.Slit(0.1).edges(), optics.Spider(3, 0.1),
         optics.Zernike(coefficients=dict.fromkeys(range(4, 30), 0.01)),
         distortion.BrownConrady(focal_um=8000.0, k1=-0.1), distortion.Fisheye(projection="equidistant", focal_um=8000.0),
+        distortion.Omnidirectional(xi=1.2, focal_um=8000.0), distortion.ExtendedUnified(alpha=0.6, beta=1.1, focal_um=8000.0),
+        distortion.DoubleSphere(xi=-0.2, alpha=0.6, focal_um=8000.0), distortion.FieldOfView(w_rad=0.9, focal_um=8000.0),
         distortion.PolynomialFisheye(k=(0.1, 0.0, 0.0, 0.0), focal_um=8000.0), distortion.Scaramuzza(a=(-500.0, 1e-4, 0.0, 0.0), pixel_um=2.0, focal_um=1000.0),
         Found(data=np.ones((3, 100, 100))),
         fs.scene.Cube(data=np.ones((3, 100, 100))),
