@@ -2,8 +2,9 @@
 Power maps in FITS images: axes x, y and wavelength, bottom row first.
 
 The reader supports a linear world coordinate system (FITS standard 4.0, section 8: ``CTYPE``, ``CRPIX``, ``CRVAL``, ``CDELT``
-or a diagonal ``CD``) with a length as ``CUNIT``, or the pixel size in µm, ``XPIXSZ`` and ``YPIXSZ``; and ``BUNIT``. The writer
-also stores these metadata as JSON in the keyword ``FOVEASIM``, because numbers in a header are rounded.
+or a diagonal ``CD``; without ``CRPIX`` the reference pixel is 0, as in the standard) with a length as ``CUNIT``, or the pixel
+size in µm, ``XPIXSZ`` and ``YPIXSZ``; and ``BUNIT``. The writer also stores these metadata as JSON in the keyword
+``FOVEASIM``, because numbers in a header are rounded.
 """
 
 from __future__ import annotations
@@ -63,12 +64,11 @@ def read(path: Path, name: str | None) -> Found:
         hdu = _find_image(file, name)
         header = hdu.header
         data = read_image(hdu, path.stat().st_size)
-        n_axes = data.ndim
         text = header.get(KEYWORD)
         found = found_in_metadata(text if isinstance(text, str) else "", data, is_y_descending=False)
         if found.pitch_um is not None:
             return found
-        return replace(found, **_header_values(header, data.shape, n_axes))
+        return replace(found, **_header_values(header, data.shape))
 
 
 def _find_image(file: Any, name: str | None) -> Any:
@@ -89,16 +89,16 @@ def _find_image(file: Any, name: str | None) -> Any:
     raise FormatError("contains no image" if name is None else f"contains no image {name!r:.40}")
 
 
-def _header_values(header: Any, shape: tuple[int, ...], n_axes: int) -> dict[str, Any]:
+def _header_values(header: Any, shape: tuple[int, ...]) -> dict[str, Any]:
     """Return pitch, origin, wavelengths and unit from a header."""
     metadata: dict[str, Any] = _plane_values(header, shape)
-    if n_axes >= 3 and str(header.get("CTYPE3", "")).strip().upper() in WAVES:
+    if len(shape) >= 3 and str(header.get("CTYPE3", "")).strip().upper() in WAVES:
         unit_um = length_in_um(str(header.get("CUNIT3", "m")))
         step, start = _step(header, 3), _number(header, "CRVAL3", 0)
         if unit_um is None:
             raise FormatError(f"has the wavelength unit {str(header.get('CUNIT3'))!r:.20}, expected a unit of length")
         if step is not None:
-            channel = np.arange(shape[-3]) + 1.0 - _number(header, "CRPIX3", 1)
+            channel = np.arange(shape[-3]) + 1.0 - _number(header, "CRPIX3", 0)
             metadata["wavelength_nm"] = ((start + step * channel) * (unit_um * 1e3)).tolist()
     unit = header.get("BUNIT")
     if isinstance(unit, str) and unit.strip():
@@ -116,7 +116,7 @@ def _plane_values(header: Any, shape: tuple[int, ...]) -> dict[str, Any]:
         for axis, (step, unit_um, n) in enumerate(zip(steps, units_um, shape[::-1][:2], strict=True), start=1):
             assert step is not None
             assert unit_um is not None
-            start, at = _number(header, f"CRVAL{axis}", 0), _number(header, f"CRPIX{axis}", 1)
+            start, at = _number(header, f"CRVAL{axis}", 0), _number(header, f"CRPIX{axis}", 0)
             edges = (start + step * (0.5 - at), start + step * (n + 0.5 - at))
             pitch.append(abs(step) * unit_um)
             origin.append(min(edges) * unit_um)

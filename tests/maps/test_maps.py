@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import os
@@ -383,6 +384,21 @@ def test_fits_header_specifies_all_metadata(tmp_path):
     np.testing.assert_allclose(read.grid.origin_um, (9.0, -3.0))
     np.testing.assert_allclose(read.wavelength_nm, (450.0, 550.0))
     np.testing.assert_allclose(read.data, 10.0)
+
+
+@pytest.mark.parametrize("given", [{}, {"CRPIX1": 2.5}, {"CRPIX1": 1.0, "CRPIX2": 3.0, "CRPIX3": 2.0}])
+def test_fits_positions_are_those_of_astropy(tmp_path, given):
+    """Missing keywords of the reference pixel are 0 (FITS standard 4.0, table 22)."""
+    values = {"CTYPE1": "LINEAR", "CTYPE2": "LINEAR", "CTYPE3": "WAVE", "CUNIT1": "um", "CUNIT2": "um", "CUNIT3": "nm"}
+    steps = {"CRVAL1": 10.0, "CDELT1": 2.0, "CRVAL2": -4.0, "CDELT2": 3.0, "CRVAL3": 500.0, "CDELT3": 50.0}
+    header = fits.Header({**values, **steps, **given, "BUNIT": "W m-2"})
+    fits.writeto(tmp_path / "map.fits", np.ones((2, 3, 4)), header)
+    read = read_power_map(tmp_path / "map.fits")
+    world = importlib.import_module("astropy.wcs").WCS(header)
+
+    first_um = np.array(world.pixel_to_world_values(0, 0, 0)) * [1.0, 1.0, 1e9]  # wavelengths in m
+    np.testing.assert_allclose(read.grid.origin_um, first_um[:2] - [1.0, 1.5])
+    np.testing.assert_allclose(read.wavelength_nm, [first_um[2], first_um[2] + 50.0])
 
 
 def test_fits_extension_is_selected_by_name(tmp_path):
