@@ -57,7 +57,6 @@ __all__ = [
     "InterPixelCapacitance",
     "Inverse",
     "KernelCrosstalk",
-    "Limits",
     "Linearisation",
     "Microlens",
     "NoiseBudget",
