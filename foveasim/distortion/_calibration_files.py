@@ -33,8 +33,7 @@ IRRELEVANT = frozenset((
     "calibrationtime", "nframes", "nrofframes", "boardwidth", "boardheight", "squaresize", "markersize", "flags", "flagvalue",
     "aspectratio", "fixaspectratio", "avgreprojectionerror", "perviewreprojectionerrors", "extrinsicparameters", "imagepoints",
     "gridpoints", "rms", "sensormodel",
-    # stereo: pose of the second camera, rectification
-    "r", "t", "e", "f", "r1", "r2", "p1", "p2", "q", "p", "rotationmatrix", "translationvector",
+    "rotationmatrix", "translationvector",
     # ROS
     "header", "cameraname", "rectificationmatrix", "projectionmatrix",
     # Kalibr, EuRoC, VINS
@@ -46,6 +45,8 @@ IRRELEVANT = frozenset((
     "meanreprojectionerror", "reprojectedpoints", "rotationmatrices", "focallength", "principalpoint", "patternextrinsics",
     "distcoeffsestimationtype",
 ))  # fmt: skip
+#: Poses and rectification of stereo cameras: irrelevant if they are matrices, not coefficients of the same name.
+POSES = frozenset(("r", "t", "e", "f", "r1", "r2", "p1", "p2", "q", "p"))
 #: Names of the same thing.
 MATRIX = ("cameramatrix", "k", "m", "intrinsicmatrix")
 COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "d")
@@ -234,8 +235,9 @@ class _Keys:
 
     def check(self) -> None:
         """Raise ConfigError when there is a key that was not read and may change the image."""
+        matrices = {key for key in POSES & self.values.keys() if isinstance(self.values[key], list | dict)}
         for key, name in self.names.items():
-            if key not in self.used and key not in IRRELEVANT and key not in self.ignore:
+            if key not in self.used | IRRELEVANT | matrices | self.ignore:
                 raise ConfigError(
                     self.path,
                     f"has the key '{name}', which is not known; if it does not change the image, pass ignore=['{name}']",

@@ -199,6 +199,7 @@ def test_camera_info_of_ros(tmp_path):
     for old, new, message in (
         ("binning_x: 0", "binning_x: 2", "has binned pixels ('binning_x')"),
         ("x_offset: 0", "x_offset: 8", "has a region of interest ('roi')"),
+        ("D: [", "p1: 0.1\nD: [", "has the key 'p1', which is not known"),
         ("binning_y: 1", "binning_y: 1\nmirrored: true", "has the key 'mirrored', which is not known"),
     ):
         path.write_text(filled.replace(old, new))
