@@ -380,7 +380,7 @@ def test_prediction_equals_moments_of_captures(shot):
 def test_table_contains_every_pair():
     values = [*map(list, axes().values()), invariants()]
     found = set().union(*map(pairs_of, ROWS))
-    compute = "run: python tests/reference/covering.py"
+    compute = "run: PYTHONPATH=tests python tests/reference/covering.py"
 
     assert [row for row in ROWS if not is_possible(row)] == [], compute
     assert set(possible_pairs(values, is_possible)) - found == set(), compute

@@ -2,8 +2,8 @@
 Covering array of tests/compositions: a stored table in which each possible pair of values of two axes occurs.
 
 Its axes are those of ``reference.features``, and the invariants of ``test_invariants.py``. The first ``N_DEFAULT`` rows,
-those of the default run, contain each value. After a change of an axis, ``python tests/reference/covering.py`` stores the table again:
-rows that remain possible are kept, and rows with the missing pairs are added.
+those of the default run, contain each value. After a change of an axis, ``PYTHONPATH=tests python tests/reference/covering.py``
+stores the table again: rows that remain possible are kept, and rows with the missing pairs are added.
 """
 
 from __future__ import annotations
