@@ -68,9 +68,9 @@ def with_coefficients(lens: Lens, names: Iterable[str], values: Any) -> Lens:
 
 def _scale(lens: Lens, name: str) -> float:
     """Return the size of a coefficient that distorts strongly at a radius of a focal length."""
-    if name.startswith("a["):  # of Scaramuzza: a0 + a2 r² + a3 r³ + a4 r⁴, in pixels
-        focal = abs(_get(lens, "a[0]"))
-        return focal ** (1.0 - (0, 2, 3, 4)[int(name[2:-1])])
+    if name.startswith("a["):  # of Scaramuzza: a0 + a2 r² + a3 r³ + ..., in pixels
+        focal, k = abs(_get(lens, "a[0]")), int(name[2:-1])
+        return focal ** (1.0 - (k + 1 if k else 0))
     return 1.0
 
 
