@@ -12,7 +12,7 @@ from torch.func import functional_call
 
 import foveasim as fs
 from foveasim import learn
-from foveasim.distortion import BrownConrady, Fisheye, PolynomialFisheye, Scaramuzza
+from foveasim.distortion import BrownConrady, Fisheye, Omnidirectional, PolynomialFisheye, Scaramuzza
 from foveasim.integrate import UndistortedOutlines
 from foveasim.learn.distortion import coefficient_values
 from foveasim.optics import LateralColour, PSFGrid, PupilImage, Seidel, Zernike
@@ -199,6 +199,9 @@ def test_wrong_imaging_tensors_are_rejected(arguments, message):
         (BrownConrady(focal_um=(1000.0, 1010.0), k1=0.05), ("k1", "k2")),
         (PolynomialFisheye(focal_um=800.0, k=(0.02, -0.01, 0.0, 0.0)), ("k[0]", "k[1]", "k[3]")),
         (Scaramuzza(a=(1.57e3, -2.75e-4, 3.76e-8, -3.64e-11), pixel_um=2.2, focal_um=3454.0), ("a[1]",)),
+        (Scaramuzza(a=(500.0, -4e-4, 1e-7, 1e-10, 1e-14, 1e-17), pixel_um=3.0, focal_um=900.0), ("a[4]", "a[5]")),
+        (Omnidirectional(xi=1.1, k1=-0.05, focal_um=900.0), ("xi", "k1")),
+        (BrownConrady(k1=-0.1, s1=0.01, tau_x_rad=0.1, focal_um=900.0), ("s1", "tau_x_rad")),
         (Fisheye(projection="equidistant", focal_um=900.0), ()),
     ],
 )
