@@ -406,11 +406,10 @@ class Capture:
         ratio : (n_site,) float64
         """
         known = self._sensor_or(sensor)
-        exposure_s = float(self.settings.get("exposure_s", 0.0))
         dark_e = np.broadcast_to(
-            known.expected_electrons(np.zeros(self.layout.n_sites), exposure_s), self.expected_e.shape
+            known.expected_electrons(np.zeros(self.layout.n_sites), self._exposure_s), self.expected_e.shape
         )
-        return signal_to_noise(known, self.expected_e, dark_e, exposure_s=exposure_s).ratio
+        return signal_to_noise(known, self.expected_e, dark_e, exposure_s=self._exposure_s).ratio
 
     def expected_code(self, *, sensor: Sensor | None = None) -> Floats:
         """
@@ -427,8 +426,12 @@ class Capture:
         -------
         mean_dn : (n_site,) float64, DN
         """
-        exposure_s = float(self.settings.get("exposure_s", 0.0))
-        return self._sensor_or(sensor).predict(self.expected_e, exposure_s=exposure_s)[0]
+        return self._sensor_or(sensor).predict(self.expected_e, exposure_s=self._exposure_s)[0]
+
+    @property
+    def _exposure_s(self) -> float:
+        """Exposure time of the settings; 0 without one."""
+        return float(self.settings.get("exposure_s", 0.0))
 
     def _check_sensor(self, sensor: Sensor | None) -> None:
         """Raise when a sensor has another layout than the capture."""
@@ -455,11 +458,10 @@ class Capture:
         response = self.layout.area_um2 * light_response * (np.mean(e_per_dn) / e_per_dn)
         if not is_estimated:
             return values, response, None
-        exposure_s = float(self.settings.get("exposure_s", 0.0))
         if of in ("code", "light_e"):
-            estimates = estimate_from_code(self.code, electronics, exposure_s)
+            estimates = estimate_from_code(self.code, electronics, self._exposure_s)
         else:
-            estimates = estimate_from_charge(getattr(self, of), electronics, exposure_s)
+            estimates = estimate_from_charge(getattr(self, of), electronics, self._exposure_s)
         values = estimates.light_e / e_per_dn
         if is_fitted:
             values[estimates.is_saturated] = np.nan

@@ -19,7 +19,7 @@ from foveasim._core.calls import publish
 from foveasim._core.names import possible_names
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, words_and_unit
+from foveasim._core.validation import Floats, title_and_unit, words_and_unit
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout.model import Layout
 
@@ -81,6 +81,14 @@ class ColumnInfo:
 
     __repr__ = short_repr
 
+    def __post_init__(self) -> None:
+        try:
+            is_number = np.dtype(self.dtype).kind in "biuf"
+        except TypeError:
+            is_number = False
+        if not is_number:
+            raise ParameterError("dtype", "must be the name of a type of numbers, such as 'f8' or 'i4'", self.dtype)
+
     @property
     def heading(self) -> str:
         """Title and unit, such as ``"electrons / e-"``."""
@@ -109,8 +117,8 @@ def column_info(name: str) -> ColumnInfo:
     """
     COLUMNS.find("column", name)
     found: ColumnInfo = COLUMNS.info(name) or ColumnInfo()
-    words, unit = words_and_unit(name)
-    return replace(found, title=found.title or words, unit=found.unit if found.unit or found.title else unit)
+    title, unit = title_and_unit(name, found.title, found.unit)
+    return replace(found, title=title, unit=unit)
 
 
 def find_column(
@@ -126,9 +134,8 @@ def find_column(
         return compute_column(name, capture, sensor), column_info(name)
     if name in layout.columns or name in OF_LAYOUT:
         words, unit = words_and_unit(name)
-        return layout.columns[name] if name in layout.columns else getattr(layout, name), ColumnInfo(
-            title=words, unit=unit
-        )
+        values: NDArray[Any] = layout.columns[name] if name in layout.columns else getattr(layout, name)
+        return values, ColumnInfo(title=words, unit=unit)
     known = {*(COLUMNS if capture is not None else ()), *OF_LAYOUT, *layout.columns}
     raise ParameterError(parameter, "must be the name of a column", name, hint=possible_names(name, sorted(known)))
 

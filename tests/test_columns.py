@@ -142,6 +142,8 @@ def test_wrong_columns_are_named(register, capture):
         ParameterError, match=r"'name' must be the name of a column, got 'elctrons'; did you mean 'electrons'"
     ):
         capture.column("elctrons")
+    with pytest.raises(ParameterError, match=r"'dtype' must be the name of a type of numbers, such as 'f8'"):
+        ColumnInfo(dtype="banana")
     with pytest.raises(ParameterError, match=r"fields"):
         fs.explore.Dataset(np.full((1, 8, 8), 9, np.uint8), SHOT, fields=("kode",))
 

@@ -104,6 +104,12 @@ def words_and_unit(name: str) -> tuple[str, str]:
     return bare.replace("_", " ").strip() or name, unit
 
 
+def title_and_unit(name: str, title: str, unit: str) -> tuple[str, str]:
+    """Return a declared title and unit; without a title, those of the name."""
+    words, suffix_unit = words_and_unit(name)
+    return title or words, unit if unit or title else suffix_unit
+
+
 def check_number(
     name: str,
     value: object,

@@ -1,16 +1,20 @@
-"""Small text files: UTF-8, with a limit of their size, and tables in CSV."""
+"""Small text files that are not trusted: UTF-8, tables in CSV, XML."""
 
 from __future__ import annotations
 
 import csv
 import io
+import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
 
 from foveasim._core.names import missing_path
 from foveasim.errors import FileError
 
-__all__ = ["read_columns", "read_text"]
+__all__ = ["parse_xml", "read_columns", "read_text"]
+
+#: Largest depth of elements in XML; the supported files have a few levels.
+MAX_XML_DEPTH = 50
 
 
 def read_text(path: Path, what: str, max_bytes: int) -> str:
@@ -58,4 +62,27 @@ def read_columns(path: Path, what: str, names: Sequence[str], max_bytes: int) ->
         if len(line) != len(header):
             raise FileError(path, f"has {len(line)} values in line {number}, expected {len(header)}")
         found.append((number, [line[column].strip() for column in columns]))
+    return found
+
+
+def parse_xml(source: Path, content: bytes, root: str, what: str, *, error: type[FileError] = FileError) -> ET.Element:
+    """
+    Return the root element of an XML file of another program.
+
+    ``root``: required tag. ``what``: expected kind of the file, for messages: ``"KLayout report database"``. Raises ``error``
+    when the file is not XML, declares entities, which can expand without limit, is too deep, or has another root.
+    """
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        raise error(source, f"declares XML entities, which are not allowed in a {what}")
+    try:
+        found = ET.fromstring(content)  # noqa: S314 -- entities are rejected above
+    except ET.ParseError as problem:
+        raise error(source, f"is corrupt, or not a {what} ({problem})") from None
+    if found.tag != root:
+        raise error(source, f"is not a {what}, whose root is {root}; got {found.tag!r:.40}")
+    level, depth = [found], 1
+    while level := [child for element in level for child in element]:
+        depth += 1
+        if depth > MAX_XML_DEPTH:
+            raise error(source, f"has elements in more than {MAX_XML_DEPTH} levels, which a {what} cannot have")
     return found

@@ -111,17 +111,20 @@ class BrownConrady(LensBase):
             return factor, (above_slope - factor * below_slope) / below
 
     def _map(self, xy: Floats) -> Floats:
+        flat = self._map_before_tilt(xy)
+        return flat if self._tilt is None else _project(self._tilt, flat)
+
+    def _map_before_tilt(self, xy: Floats) -> Floats:
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
         factor, _ = self._radial(r2)
-        flat = np.stack(
+        return np.stack(
             (
                 x * factor + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x) + r2 * (self.s1 + self.s2 * r2),
                 y * factor + 2.0 * self.p2 * x * y + self.p1 * (r2 + 2.0 * y * y) + r2 * (self.s3 + self.s4 * r2),
             ),
             axis=1,
         )
-        return flat if self._tilt is None else _project(self._tilt, flat)
 
     @cached_property
     def _tilt(self) -> Floats | None:
@@ -155,11 +158,10 @@ class BrownConrady(LensBase):
     @cached_property
     def _fold(self) -> Floats:
         """Smallest ideal radius with determinant 0 per direction; infinite without a fold."""
-        angle_rad = 2.0 * math.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
         if self.p1 == self.p2 == self.s1 == self.s2 == self.s3 == self.s4 == 0.0:
             return np.full(N_DIRECTIONS, self._radial_fold)
         # Along each direction the determinant times the fourth power of the denominator is a polynomial in the radius.
-        c, s = np.cos(angle_rad)[:, np.newaxis], np.sin(angle_rad)[:, np.newaxis]
+        c, s = directions().T[:, :, np.newaxis]
         above, below, r = self._parts()
         plain = above * below
         # Products of the square of the denominator with r dR/dr, with r, and (above) with R.
@@ -199,12 +201,26 @@ class BrownConrady(LensBase):
         return float(min(smallest_roots(p.coef)[0] for p in (growth, above, below)))
 
     def _limits(self) -> tuple[float, float]:
-        ideal = float(self._fold.min())
+        ideal = min(float(self._fold.min()), self._horizon)
         if math.isinf(ideal):
             return math.inf, math.inf
-        angle_rad = 2.0 * math.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
-        boundary = ideal * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
-        return ideal, float(np.nanmin(np.hypot(*self._map(boundary).T)))  # a tilted sensor has a horizon
+        return ideal, float(np.nanmin(np.hypot(*self._map(ideal * directions()).T)))  # NaN at the horizon
+
+    @cached_property
+    def _horizon(self) -> float:
+        """Smallest ideal radius whose image on a tilted sensor is infinitely far away."""
+        if self._tilt is None:
+            return math.inf
+        from scipy.optimize import brentq  # its import is slow
+
+        *slope, at_centre = self._tilt[2]
+
+        def depth(radius: float) -> float:
+            return float((self._map_before_tilt(radius * directions()) @ slope).min()) + float(at_centre)
+
+        radii = np.geomspace(1e-3, min(float(self._fold.min()), MAX_RADIUS), N_DIRECTIONS)
+        first = next((k for k, radius in enumerate(radii) if depth(radius) <= 0.0), 0)
+        return float(brentq(depth, radii[first - 1], radii[first])) if first else math.inf
 
     def _is_inside(self, xy: Floats) -> Bools:
         """Return whether points lie within the fold."""
@@ -242,6 +258,12 @@ class BrownConrady(LensBase):
         reach = np.maximum.accumulate(table * factor)
         ideal = np.interp(reach[-1] * np.linspace(0.0, 1.0, START_POINTS), reach, table)
         return np.minimum(ideal, 0.98 * end), (START_POINTS - 1) / float(reach[-1])
+
+
+def directions() -> Floats:
+    """Return unit vectors in all directions, (N_DIRECTIONS, 2)."""
+    angle_rad = 2.0 * math.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
+    return np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
 
 
 def _project(homography: Floats, xy: Floats) -> Floats:

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import math
 import re
-import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from foveasim._core.calls import POSITIVE
 from foveasim._core.names import possible_names
 from foveasim._core.validation import Floats, finite_array
+from foveasim._io.text_files import parse_xml
 from foveasim.distortion._brown_conrady import BrownConrady
 from foveasim.distortion._calibration import centre_um, from_opencv
 from foveasim.distortion._fisheye import PolynomialFisheye, Scaramuzza
@@ -292,16 +293,9 @@ def _plain_yaml(text: str) -> str:
 
 def _from_xml(path: Path, text: str) -> dict[str, Any]:
     """Return the values of an XML file of OpenCV."""
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ConfigError(path, "declares XML entities, which are not allowed in a calibration")
-    try:
-        root = ET.fromstring(text)  # noqa: S314 -- entities, which can expand without limit, are rejected above
-    except ET.ParseError as error:
-        raise ConfigError(path, f"is not XML ({error})") from None
-    if root.tag != "opencv_storage":
-        raise ConfigError(path, f"must be an XML file of OpenCV with the root opencv_storage, got {root.tag!r:.40}")
+    root = parse_xml(path, text.encode(), "opencv_storage", "calibration of OpenCV", error=ConfigError)
 
-    def value(element: ET.Element) -> Any:
+    def value(element: Element) -> Any:
         if len(element):
             return {each.tag: value(each) for each in element}
         words = [_number(word) for word in (element.text or "").split()]

@@ -11,12 +11,9 @@ import numpy as np
 from foveasim._core.calls import FINITE, Limits, OwnCheck
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats
-from foveasim.distortion._brown_conrady import BrownConrady
+from foveasim.distortion._brown_conrady import BrownConrady, directions
 from foveasim.distortion._fisheye import ANGLE_MARGIN_RAD, _AngularLens
 from foveasim.distortion._registry import LENSES
-
-#: Directions in which the boundary of a distorted image circle is followed.
-N_DIRECTIONS = 720
 
 
 @LENSES.register(
@@ -106,8 +103,7 @@ class Omnidirectional(_AngularLens):
         fold, real = self._distortion._limits()  # noqa: SLF001 -- normalised radii
         if scale * fold < height:
             return math.tan(float(self._theta_rad(np.array([scale * fold]))[0])), scale * real
-        angle_rad = 2.0 * math.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
-        boundary = height / scale * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
+        boundary = height / scale * directions()
         return ideal, scale * float(np.hypot(*self._distortion._forward(boundary).T).min())  # noqa: SLF001
 
 

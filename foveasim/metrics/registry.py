@@ -16,7 +16,7 @@ import numpy as np
 from foveasim._core.calls.docstrings import Docstring
 from foveasim._core.registry import Registry
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, Ints, check_choice, words_and_unit
+from foveasim._core.validation import Floats, Ints, check_choice, title_and_unit
 from foveasim.camera import Camera
 from foveasim.capture import Capture
 from foveasim.errors import SimulationError
@@ -149,12 +149,12 @@ def metric_info(name: str) -> MetricInfo:
     """
     function = METRICS.find("metric", name)
     found: MetricInfo = METRICS.info(name) or MetricInfo()
-    words, unit = words_and_unit(name)
+    title, unit = title_and_unit(name, found.title, found.unit)
     summary = Docstring.of(function).summary
     return replace(
         found,
-        title=found.title or words,
-        unit=found.unit if found.unit or found.title else unit,
+        title=title,
+        unit=unit,
         definition=found.definition or summary.removeprefix("Return ").removesuffix("."),
     )
 

@@ -239,8 +239,9 @@ def test_ocamcalib_polynomials_of_any_degree(tmp_path, n):
     ("text", "message"),
     [
         ("<?xml version='1.0'?>\n<!DOCTYPE a [<!ENTITY b 'c'>]>\n<opencv_storage/>", "declares XML entities"),
-        ("<opencv_storage><a></opencv_storage>", "is not XML"),
-        ("<calibration/>", "must be an XML file of OpenCV with the root opencv_storage, got 'calibration'"),
+        ("<opencv_storage><a></opencv_storage>", "is corrupt, or not a calibration of OpenCV"),
+        ("<calibration/>", "is not a calibration of OpenCV, whose root is opencv_storage; got 'calibration'"),
+        ("<opencv_storage>" + "<a>" * 20000 + "</a>" * 20000 + "</opencv_storage>", "has elements in more than 50 levels"),
         (KALIBR.replace("MODEL", "pinhole").replace("DISTORTION", "radtan").replace("COEFFICIENTS", "0.1").replace("INTRINSICS", "1, 2, 3"), "contains several cameras; pass camera= one of cam0, cam1"),
         ("camera_model: magic\nintrinsics: [1, 2, 3, 4]", "has the unknown camera model 'magic'; possible: "),
         ("camera_model: eucm\nintrinsics: [1, 2, 3, 4]\nresolution: [64, 48]", "intrinsics must have 6 numbers, got 4"),

@@ -67,6 +67,22 @@ def test_determinant_vanishes_at_the_fold():
     assert np.nanmin(determinants(0.999 * limit_um)) < 0.02
 
 
+@pytest.mark.parametrize("tau_rad", [0.2, -0.5])
+def test_tilted_sensors_have_a_horizon(tau_rad):
+    """Rays parallel to the sensor, at f cot τ from the axis, have no image."""
+    lens = BrownConrady(focal_um=1000.0, tau_x_rad=tau_rad)
+    limit_um = 1000.0 / math.tan(abs(tau_rad))
+
+    assert lens.max_radius_um[0] == pytest.approx(limit_um, rel=1e-6)
+    beyond = [[0.0, math.copysign(1.01 * limit_um, tau_rad)]]
+    assert np.isnan(lens.distort(beyond, outside="mask")).all()
+    with pytest.raises(fs.errors.GeometryError, match=rf"the model is valid up to {limit_um:.4g}"):
+        lens.distort(beyond)
+    bent = BrownConrady(focal_um=1000.0, k1=0.2, tau_x_rad=tau_rad)  # radial distortion, then the tilt: r + 0.2 r³
+    reached = bent.max_radius_um[0] / 1000.0
+    assert reached + 0.2 * reached**3 == pytest.approx(limit_um / 1000.0, rel=1e-6)
+
+
 def test_omnidirectional_follows_mei(rays):
     xi, gamma, k1, k2, p1, p2 = 1.1, 500.0, -0.1, 0.02, 0.003, -0.002
     lens = Omnidirectional(xi=xi, focal_um=gamma * PIXEL_UM / (1.0 + xi), k1=k1, k2=k2, p1=-p1, p2=p2)

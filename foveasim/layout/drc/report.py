@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -13,6 +12,7 @@ import shapely
 from foveasim._core.extras import import_optional
 from foveasim._core.names import missing_path
 from foveasim._io.atomic import atomic_write
+from foveasim._io.text_files import parse_xml
 from foveasim.errors import FileError
 
 if TYPE_CHECKING:
@@ -112,15 +112,7 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
         raise FileError(source, missing_path(source))
     if source.stat().st_size > MAX_BYTES:
         raise FileError(source, f"is larger than {MAX_BYTES} bytes")
-    content = source.read_bytes()
-    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-        raise FileError(source, "declares XML entities, which are not allowed in a report")
-    try:
-        root = ET.fromstring(content)  # noqa: S314 -- entities, which can expand without limit, are rejected above
-    except ET.ParseError as error:
-        raise FileError(source, f"is corrupt, or not a KLayout report database ({error})") from None
-    if root.tag != "report-database":
-        raise FileError(source, "is not a KLayout report database")
+    root = parse_xml(source, source.read_bytes(), "report-database", "KLayout report database")
     found: dict[str, list[_Item]] = {}
     about: dict[str, _RuleInfo] = {}
     for name, category in _categories(root):
