@@ -6,7 +6,7 @@ Tables, figures, pages, datasets, tiles and exports have the same ones, with the
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from inspect import signature
 from operator import attrgetter
@@ -154,6 +154,12 @@ def compute_column(name: str, capture: Capture, sensor: Sensor | None = None) ->
             f"the column '{name}' must have one value for each of the {n_sites:,} sites, got the shape {values.shape}"
         )
     return values
+
+
+def registered_by_user(names: Iterable[str]) -> dict[str, tuple[Column, ColumnInfo]]:
+    """Return the functions and facts of columns that the package itself does not have."""
+    bundled = {*STORED, *COLUMNS.within("foveasim")}
+    return {name: (COLUMNS[name], COLUMNS.info(name)) for name in names if name not in bundled}
 
 
 # -- arrays of captures --------------------------------------------------------------------------------------------------

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -152,3 +155,30 @@ def test_facts_have_defaults(register):
     register("peak_um", density)
 
     assert (column_info("peak_um").title, column_info("peak_um").unit) == ("peak", "µm")
+
+
+PROGRAM = """
+import sys
+import numpy as np
+import foveasim as fs
+from foveasim.columns import COLUMNS, ColumnInfo
+
+@COLUMNS.register("charge_density", info=ColumnInfo(unit="e-/µm²"))
+def charge_density(capture):
+    return capture.electrons / capture.layout.area_um2
+
+samples = fs.explore.Dataset(np.full((2, 100, 120), 99, np.uint8), SHOT, fields=("electrons", "charge_density"))
+stored = fs.explore.write_dataset(samples, sys.argv[1], per_shard=1, workers=2)
+print(np.array_equal(stored[1]["charge_density"], stored[1]["electrons"] / 16.0))
+"""
+
+
+@pytest.mark.slow
+def test_workers_have_columns_of_the_program(tmp_path):
+    """Processes that do not import the program that registers a column, as those of a notebook."""
+    code = PROGRAM.replace("SHOT", repr(SHOT))
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, tmp_path / "a.zarr"], capture_output=True, text=True, check=False
+    )
+
+    assert done.stdout == "True\n", done.stderr

@@ -22,7 +22,7 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.threads import cached_property, default_threads
 from foveasim._core.validation import Ints, check_count
 from foveasim.capture import Capture
-from foveasim.columns import COLUMNS, STORED, column_info
+from foveasim.columns import COLUMNS, STORED, column_info, registered_by_user
 from foveasim.config import Shot, Source, build_shot, check_settings, put_setting, resolve_files
 from foveasim.errors import (
     ConfigError,
@@ -221,9 +221,13 @@ class Dataset:
 
     def __getstate__(self) -> dict[str, Any]:
         excluded = ("_cache", "_messages", "_has_warned", "layout")
-        return {name: value for name, value in self.__dict__.items() if name not in excluded}
+        state = {name: value for name, value in self.__dict__.items() if name not in excluded}
+        return state | {"_columns": registered_by_user(self.fields)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        for name, (column, info) in state.pop("_columns").items():  # of a program that this process does not run
+            if name not in COLUMNS:
+                COLUMNS.register(name, column, info=info)
         self.__dict__.update(state)
         self._reset()
 
