@@ -58,10 +58,11 @@ interface Preset { name: string; label: string; kind: string }
 interface ViewAbout {
   name: string; label: string; is_tile: boolean; is_first: boolean; is_wide: boolean; is_lazy: boolean; has_data: boolean;
 }
-interface Choice { label: string; value: any }
+// file: key of a file that the value lacks, as it lacks the required and optional parameters with these names.
+interface Choice { label: string; value: any; file?: string; required?: string[]; optional?: string[] }
 interface Control {
   key: string; id: string; label: string; unit: string; help: string; section: string; synonyms?: string; context?: string;
-  kind: "number" | "integer" | "boolean" | "text" | "list" | "choice" | "sections" | "group";
+  kind: "number" | "integer" | "boolean" | "text" | "file" | "list" | "choice" | "sections" | "group";
   do?: string; value?: string | null;  // of a choice that is no setting: its message, and the present choice
   default?: any; is_required?: boolean; is_optional?: boolean; is_item?: boolean;
   minimum?: number | null; maximum?: number | null; suggested?: number[]; scale?: "log" | "linear";
@@ -147,7 +148,7 @@ type Change =
   | { do: "preset"; name: string }
   | { do: "new_sensor"; generator: string; size_um: number[]; n_sites: number; filters?: string | null; electronics: string }
   | { do: "restore"; settings: { [name: string]: unknown } | undefined }
-  | { do: "file"; path: string | undefined; as: "scene" | "layout" | "settings" }
+  | { do: "file"; path: string | undefined; as?: "scene" | "layout" | "settings" | null }
   | { do: "video"; path: string | undefined }
   | { do: "frame"; n: number; follows?: boolean; final?: boolean }
   | { do: "follow"; t_s: number; final?: boolean }

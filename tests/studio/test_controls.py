@@ -18,7 +18,7 @@ from foveasim.studio._files import start_settings
 from foveasim.studio._settings import controls as _controls
 from foveasim.studio._settings.controls import chosen_value, controls_of, structure_of
 
-KINDS = {"number", "integer", "choice", "boolean", "text", "list", "group", "sections"}
+KINDS = {"number", "integer", "choice", "boolean", "text", "file", "list", "group", "sections"}
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +33,13 @@ def controls(demo):
 
 def by_id(controls, name):
     return next(control for control in controls if control["id"] == name)
+
+
+def complete(choice):
+    """Return the value of a choice, with a file and numbers that the page asks for."""
+    if "file" not in choice:
+        return choice["value"]
+    return {**choice["value"], choice["file"]: "name.txt", **dict.fromkeys(choice["required"], 3.0)}
 
 
 def keys_of(definition):
@@ -129,7 +136,8 @@ def test_choices_are_valid_settings(demo, controls):
             section = settings
             for name in above:
                 section = section.setdefault(name, {})
-            section[last] = [choice["value"]] if control["kind"] == "sections" else choice["value"]
+            value = complete(choice)
+            section[last] = [value] if control["kind"] == "sections" else value
             if control["key"].startswith("scene."):
                 settings["scene"].pop("pitch_um", None)
             check_settings(None, settings)
@@ -146,7 +154,7 @@ def test_sections_start_without_an_error(demo, controls):
     for control in controls:
         for choice in () if "do" in control else control.get("choices", ()):
             value = choice["value"]
-            if not isinstance(value, dict):
+            if not isinstance(value, dict) or "file" in choice:
                 continue
             settings = json.loads(json.dumps(demo))
             put_setting(None, settings, control["key"], [value] if control["kind"] == "sections" else value)

@@ -606,7 +606,7 @@ def test_uploads_never_share_a_path(recorder):
 def test_uploads_never_exceed_the_limit(recorder):
     recorder.session.n_free_bytes = 1000
     with ThreadPoolExecutor(8) as pool:
-        paths = list(pool.map(lambda _: recorder.session.add_file("a.bin", bytes(300)), range(20)))
+        paths = list(pool.map(lambda n: recorder.session.add_file("a.bin", bytes([n]) * 300), range(20)))
 
     assert sum(path is not None for path in paths) == 3
 

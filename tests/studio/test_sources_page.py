@@ -529,3 +529,43 @@ def test_link_lists_uploaded_files(visit):
     message(page, r"only the names of uploaded files: photo\.png")
     other.evaluate("link => { location.hash = link.slice(link.indexOf('#')); }", link)
     message(other, r"'photo\.png' is not available here; upload the file")
+
+
+def chosen_file(page, key, label, name, content):
+    """Choose an alternative with a file."""
+    row = page.locator(f"[data-id='{key}']")
+    page.evaluate("(key) => { studio.controls.rows.get(key).root.closest('details').open = true; }", key)
+    page.locator("#search").fill(key)
+    with page.expect_file_chooser() as chooser:
+        row.locator("select").select_option(label=label)
+    chooser.value.set_files({"name": name, "mimeType": "application/octet-stream", "buffer": content})
+
+
+def test_files_are_chosen_at_settings(visit):
+    page = visit()
+    calibration = (
+        b"image_width: 640\nimage_height: 480\ncamera_matrix: [800, 0, 319.5, 0, 800, 239.5, 0, 0, 1]\n"
+        b"distortion_coefficients: [-0.2, 0.05, 0, 0]\n"
+    )
+    chosen_file(page, "distortion", "calibration…", "left.yaml", calibration)
+    page.locator("#parameters-dialog").wait_for(timeout=TIMEOUT_MS)
+    assert page.locator("#parameters-names").inner_text().startswith("Parameters: pixel_um, focal_um")
+    page.get_by_role("button", name="Use the file").click()
+    assert page.locator("#parameters-error").inner_text() == "Required: pixel_um"
+    page.locator("#parameters-text").fill("pixel_um: 3.0\nsize: 2")
+    page.get_by_role("button", name="Use the file").click()
+    assert page.locator("#parameters-error").inner_text() == "Not a parameter: size"
+    page.locator("#parameters-text").fill("pixel_um: 3.0")
+    page.get_by_role("button", name="Use the file").click()
+    until(page, "studio.state.settings.distortion?.pixel_um === 3")
+    settle(page)
+
+    assert setting(page, "distortion.path").endswith("left.yaml")
+    assert page.locator("[data-id='distortion.path'] input").input_value() == "left.yaml"
+    with page.expect_file_chooser() as chooser:
+        page.get_by_role("button", name="Choose a file for path").click()
+    other = calibration.replace(b"-0.2", b"-0.1")
+    chooser.value.set_files({"name": "right.yaml", "mimeType": "application/octet-stream", "buffer": other})
+    until(page, "studio.state.settings.distortion.path.endsWith('right.yaml')")
+    settle(page)
+    assert page.evaluate("studio.state.errors") == {}

@@ -223,7 +223,7 @@ def test_every_kind_of_control_changes_state(visit):
         settle(page)
 
     kinds = set(page.evaluate("() => [...studio.controls.rows.values()].map((row) => row.control.kind)"))
-    assert kinds == {"number", "integer", "choice", "boolean", "text", "list", "group", "sections"}
+    assert kinds == {"number", "integer", "choice", "boolean", "text", "file", "list", "group", "sections"}
     control(page, "optics.f_number").fill("5.6")
     control(page, "optics.f_number").press("Enter")
     answer("optics.f_number", 5.6)

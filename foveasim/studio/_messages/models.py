@@ -283,10 +283,10 @@ class RestoreSettings(Change, do="restore"):
 
 
 class OpenFile(Change, do="file"):
-    """Use an uploaded file."""
+    """Use an uploaded file; without ``as`` for what its content is."""
 
     path: Path
-    use: Literal["scene", "layout", "settings"] = _must_be("scene, layout or settings", alias="as")
+    use: Literal["scene", "layout", "settings"] | None = _must_be("scene, layout or settings", None, alias="as")
 
     @property
     def chooses_filters(self) -> bool:

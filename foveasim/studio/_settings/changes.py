@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foveasim.config import get_setting, put_setting
 from foveasim.config._models import expand_preset
+from foveasim.errors import FileError
 from foveasim.layout import LAYOUTS
 from foveasim.sensor import PRESETS
 from foveasim.studio._files import with_layout
 from foveasim.studio._messages.models import DeleteValue, OpenFile, ResetValue, handles
 from foveasim.studio._settings.controls import controls_of
+from foveasim.studio._settings.gaze import rows_of_file
 from foveasim.studio._settings.templates import has_mosaic
 from foveasim.studio._settings.unknowns import balanced
+from foveasim.studio._settings.uses import PLACES, use_of
 
 if TYPE_CHECKING:
     from foveasim.studio._session import Session
@@ -110,16 +114,37 @@ def with_picture(settings: Mapping[str, Any], start: Mapping[str, Any], path: st
     return found
 
 
+def with_file(settings: Mapping[str, Any], start: Mapping[str, Any], key: str, label: str, path: str) -> dict[str, Any]:
+    """
+    Return settings with a file: the alternative of a setting that has this label.
+
+    Raises FileError when the alternative requires further parameters.
+    """
+    found = copy.deepcopy(dict(settings))
+    choices = [one for control in controls_of(found, start) if control["key"] == key for one in control["choices"]]
+    choice = next(one for one in choices if one["label"] == label)
+    if choice.get("required"):
+        names = " and ".join(choice["required"])
+        raise FileError(Path(path), f"requires {names}; choose it in the list of the setting {key} ({label})")
+    put_setting(None, found, key, {**choice["value"], choice.get("file", "path"): path})
+    return found
+
+
 @handles(OpenFile)
 def _open_file(session: Session, message: OpenFile) -> dict[str, Any]:
     settings, path = session.history.settings, message.path
-    match message.use:
+    use = message.use or use_of(Path(session.files.available(path)))
+    match use:
         case "scene":
             return with_picture(settings, session.start.settings, session.reduced(path))
         case "layout":
+            message.use = "layout"
             return with_layout(settings, session.files.layout_of(path))
         case "settings":
             return session.files.settings_of(path)
+        case "gaze":
+            return {**settings, "gaze_path": rows_of_file(path)}
+    return with_file(settings, session.start.settings, *PLACES[use], path)
 
 
 @handles(ResetValue)

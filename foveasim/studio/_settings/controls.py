@@ -12,6 +12,7 @@ from typing import Any
 
 from foveasim._core.validation import words_and_unit
 from foveasim.config import bundled_layouts, get_setting, schema
+from foveasim.config._objects import FILE_SETTINGS
 from foveasim.studio._settings.labels import words_of
 from foveasim.studio._settings.templates import INITIAL, PER_AREA, has_mosaic, templates
 from foveasim.studio._settings.unknowns import PARAMETERS, unknown_of, unknowns_of
@@ -40,8 +41,8 @@ BOUNDS = ("minimum", "exclusiveMinimum", "maximum", "usual")
 ENUMERATED = ("integration_order",)
 #: Keys that select an alternative of a section.
 TAGS = ("kind", "generator")
-#: Required parameters that are files without a bundled one.
-FROM_FILES = {"path", "file"}
+#: Required parameters that are files without a bundled one, which the page asks for.
+FROM_FILES = ("path", "file")
 #: Optional parameters that new sections contain: framing and light of scenes.
 GIVEN = {"fit", "peak_radiance_w_m2_sr_nm", "radiance_w_m2_sr_nm"}
 #: Description of the choice of a generator's unknown.
@@ -261,8 +262,31 @@ def _items(root: dict[str, Any], options: Sequence[dict[str, Any]]) -> list[dict
 
 def _templates_of(root: dict[str, Any], items: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the sections that a list may contain and that have valid initial values."""
-    initial = [(_label(item), _initial(root, item, None)) for item in items]
-    return [{"label": label, "value": value} for label, value in initial if [] not in value.values()]
+    choices = [_choice(item, _initial(root, item, None)) for item in items]
+    return [choice for choice in choices if [] not in choice["value"].values()]
+
+
+def _choice(option: dict[str, Any], value: Any, *, is_complete: bool = False) -> dict[str, Any]:
+    """
+    Return an alternative with a value.
+
+    One with a file, unless its value is complete, contains none of the parameters: the page asks for them and for ``file``,
+    the key of the file.
+    """
+    required = option.get("required", ()) if isinstance(value, dict) and not is_complete else ()
+    name = next((name for name in FROM_FILES if name in required), None)
+    if name is None:
+        return {"label": _label(option), "value": value}
+    found = _tag(option)
+    tag = {} if found is None else {found[0]: found[1]}
+    names = [key for key in option["properties"] if key != name and key not in tag]
+    return {
+        "label": _label(option),
+        "value": tag,
+        "file": name,
+        "required": [key for key in names if key in required],
+        "optional": [key for key in names if key not in required],
+    }
 
 
 def _described(key: str, section: str, node: dict[str, Any]) -> dict[str, Any]:
@@ -372,8 +396,8 @@ def _alternatives(
     started = get_setting(start, key)
     for option in options:
         is_selected = selected is None and _is_of(option, value)
-        if not is_selected and (option.get("type") == "array" or set(option.get("required", ())) & FROM_FILES):
-            continue  # lists of values per site, and files, which are uploaded
+        if not is_selected and option.get("type") == "array":
+            continue  # lists of values per site
         if option.get("type") == "object" and "properties" in option:
             if value is not None and is_selected:
                 initial = value
@@ -385,7 +409,7 @@ def _alternatives(
             initial = _initial_value(name, option, value)
         if is_selected:
             selected = len(choices)
-        choices.append({"label": _label(option), "value": copy.deepcopy(initial)})
+        choices.append(_choice(option, copy.deepcopy(initial), is_complete=is_selected))
     if key == "layout":
         choices += [{"label": f"bundled: {each.replace('_', ' ')}", "value": each} for each in bundled_layouts()]
     return {"choices": choices, "selected": selected}
@@ -486,7 +510,7 @@ def _simple(name: str, options: list[dict[str, Any]], value: Any, default: Any, 
         case "boolean":
             return {"kind": "boolean"}
         case "string":
-            return {"kind": "text"}
+            return {"kind": "file" if name in FILE_SETTINGS else "text"}
         case _:
             length = len(option.get("prefixItems", ())) or None
             return {"kind": "list", "length": length}

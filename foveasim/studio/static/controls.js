@@ -100,7 +100,8 @@ function fillTrack(slider) {
   slider.style.setProperty("--filled", (100 * Number(slider.value)) / Math.max(1, Number(slider.max)) + "%");
 }
 
-// A row with one control. send(value, isFinal), reset() and remove() are called by the user.
+// A row with one control. send(value, isFinal), reset() and remove() are called by the user. He chooses the file of
+// chooseFile(), which returns its path, and of chooseSection(choice), which returns the section; null without one.
 class Row {
   /** @type {HTMLInputElement | HTMLSelectElement | undefined} */ field;
   /** @type {HTMLInputElement | undefined} */ slider;
@@ -154,14 +155,14 @@ class Row {
     if (kind === "choice") {
       const field = make("select");
       this.choices = choicesOf(control);
-      this.choices.forEach(({ label, value }, i) => {
-        const option = make("option", String(label ?? fieldText(value)).replaceAll("_", " "));
+      this.choices.forEach(({ label, value, file }, i) => {
+        const option = make("option", String(label ?? fieldText(value)).replaceAll("_", " ") + (file ? "…" : ""));
         option.value = String(i);
         field.append(option);
       });
       field.addEventListener("change", () => {
         const choice = this.choices[Number(field.value)];
-        if (choice) this._send(choice.value, true);
+        if (choice) this._choose(choice, (value) => value);
       });
       return field;
     }
@@ -182,13 +183,33 @@ class Row {
     return field;
   }
 
+  // Sends the value of a choice, with a file and parameters that the user chooses if it requires them.
+  /** @type {(choice: Choice, wrapped: (value: any) => any) => Promise<void>} */
+  async _choose(choice, wrapped) {
+    if (choice.file) this._show();
+    const value = choice.file ? await this.on.chooseSection(choice) : choice.value;
+    if (value !== null || !choice.file) this._send(wrapped(value), true);
+  }
+
   _build() {
     const field = this._makeField(), line = make("div", undefined, "line"), { kind } = this.control;
     this.field = field;
     field.id = this.id;
-    line.append(this.label, this.reset, field, this.unit);
+    line.append(this.label, this.reset, field, kind === "file" ? this._fileButton() : this.unit);
     this.root.append(line);
     if (kind === "number" || kind === "integer") this._buildSlider(field);
+  }
+
+  _fileButton() {
+    const button = make("button", "…", "choose");
+    button.type = "button";
+    button.title = "Choose a file";
+    button.setAttribute("aria-label", "Choose a file for " + this.name);
+    button.addEventListener("click", async () => {
+      const path = await this.on.chooseFile();
+      if (path) this._send(path, true);
+    });
+    return button;
   }
 
   _buildSlider(field) {
@@ -237,7 +258,7 @@ class Row {
     const adder = make("select");
     adder.id = this.id;
     this.choices = choicesOf(this.control);
-    ["Add…", ...this.choices.map(({ label }) => label)].forEach((text, i) => {
+    ["Add…", ...this.choices.map(({ label, file }) => label + (file ? "…" : ""))].forEach((text, i) => {
       const option = make("option", text);
       option.value = String(i - 1);
       adder.append(option);
@@ -245,7 +266,7 @@ class Row {
     adder.addEventListener("change", () => {
       const choice = this.choices[Number(adder.value)];
       adder.value = "-1";
-      if (choice) this._send([...(this.value || []), choice.value], true);
+      if (choice) this._choose(choice, (value) => [...(this.value || []), value]);
     });
     const line = make("div", undefined, "line");
     line.append(this.label, this.reset, adder, this.unit);
@@ -290,12 +311,18 @@ class Row {
     this._commit(field);
   }
 
+  // Text of a value in its field: of a file that was sent, its name.
+  _text(value) {
+    const text = fieldText(value);
+    return this.control.kind === "file" && /[\\/]foveasim-studio-/.test(text) ? text.replace(/.*[\\/]/, "") : text;
+  }
+
   _commit(field) {
     if (!this.isDirty) return;
     this.isDirty = false;
     const { kind } = this.control, text = field.value;
-    if (text === fieldText(this.value) && this.error.hidden) return;
-    if (text.trim() === "" && kind !== "text") this.on.remove();
+    if (text === this._text(this.value) && this.error.hidden) return;
+    if (text.trim() === "" && kind !== "text" && kind !== "file") this.on.remove();
     else {
       const number = hasNumbers(this.control) ? numberOf(text, this.control.unit) : NaN;
       this._send(kind === "list" ? listOf(text) : Number.isFinite(number) ? number : text.trim(), true);
@@ -349,7 +376,11 @@ class Row {
       else if (chosen >= 0) other?.remove();
       change(field, { value: String(chosen) });  // browsers examine all forms again when a choice is set
     } else if (control.kind === "boolean") Object.assign(field, { checked: Boolean(value ?? control.default) });
-    else if (field.value !== fieldText(value)) field.value = fieldText(value);
+    else {
+      const text = this._text(value);
+      if (field.value !== text) field.value = text;
+      if (control.kind === "file") field.title = fieldText(value);
+    }
     if (slider) this._place(slider, typeof value === "number" ? value : typeof this.solved === "number" ? this.solved : NaN);
   }
 }
@@ -357,7 +388,8 @@ class Row {
 export class Controls {
   root; search; onlyChanged; on; hint;
 
-  // Callbacks: send(key, value, isFinal) and act(do, name) return the number of the message; reset(key), remove(key).
+  // Callbacks: send(key, value, isFinal) and act(do, name) return the number of the message; reset(key), remove(key);
+  // chooseFile() and chooseSection(choice), as those of rows.
   constructor(root, search, onlyChanged, hint, on) {
     Object.assign(this, { root, search, onlyChanged, hint, on });
     hint.textContent = HINT;
@@ -401,6 +433,7 @@ export class Controls {
         send: (value, isFinal) => (act ? this.on.act(act, value) : this.on.send(control.key, value, isFinal)),
         reset: () => this.on.reset(control.key),
         remove: () => this.on.remove(control.key),
+        chooseFile: this.on.chooseFile, chooseSection: this.on.chooseSection,
       });
       row.shape = shape;
       row.refresh(control);

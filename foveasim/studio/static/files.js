@@ -1,21 +1,33 @@
 // Files and links: dropped and chosen files, the menu, texts of the state, and links that restore it.
 
-import { $, download, downloadText, notice } from "/web/page_parts.js";
+import { $, download, downloadText, make, notice } from "/web/page_parts.js";
 import { fragmentOf, settingsOf, stateOf } from "./links.js";
 import { confirmed, copyText, listenToMenu, showText } from "./menus.js";
 import { awaited } from "./pending.js";
 import { isVideo } from "./sources.js";
 
-// How the server uses a file: by its name.
-function useOf(name) {
-  if (isVideo(name)) return "video";
-  if (/\.csv$/i.test(name)) return "gaze";
-  if (/\.ya?ml$/i.test(name)) return "settings";
-  return /\.(gds|gds2|gdsii|oas|oasis|geojson|json|npz|svg)(\.gz)?$/i.test(name) ? "layout" : "scene";
+// Of several files, the one that names or describes the others.
+const isIndex = ({ name }) => /\.(hdr|ya?ml)$/i.test(name);
+
+// Parameters in lines "name: value", whose values are JSON or words.
+/** @type {(text: string, names: string[], required: string[]) => { found: { [name: string]: any }, problem: string }} */
+function parametersOf(text, names, required) {
+  /** @type {{ [name: string]: any }} */
+  const found = {};
+  for (const line of text.split("\n").map((each) => each.trim()).filter(Boolean)) {
+    const [, name = "", value = ""] = /^(\w+)\s*[:=]\s*(.*)$/.exec(line) || [];
+    if (!names.includes(name)) return { found, problem: "Not a parameter: " + (name || line) };
+    if (!value) continue;
+    try { found[name] = JSON.parse(value); } catch { found[name] = value; }
+  }
+  const missing = required.filter((name) => !(name in found));
+  return { found, problem: missing.length ? "Required: " + missing.join(", ") : "" };
 }
 
 export class Files {
   connection; on; wantsToken = false;
+  // Parameters of files, by the label of their section.
+  /** @type {Map<string, string>} */ typed = new Map();
 
   // Callbacks: busy(text) while a file is sent, with null at its end; dropped(transfer) returns whether it takes the files.
   constructor(connection, on) {
@@ -84,17 +96,75 @@ export class Files {
     }
   }
 
-  async upload(file) {
+  // Sends a file; returns its path, or null after a notice.
+  async _sent(file) {
     this.on.busy("sending " + file.name + "…");
-    const answer = await this.connection.upload(file);
-    if (answer.error) {
-      this.on.busy(null);
-      notice(file.name + ": " + answer.error);
-      return;
+    const { path, error } = await this.connection.upload(file);
+    if (path) return path;
+    this.on.busy(null);
+    notice(file.name + ": " + error);
+    return null;
+  }
+
+  async upload(file) {
+    const path = await this._sent(file);
+    if (path) this.connection.send(isVideo(file.name) ? { do: "video", path } : { do: "file", path });
+  }
+
+  // Lets the user choose a file for a setting, with those that it names; returns its path, or null.
+  /** @type {() => Promise<string | null>} */
+  choose() {
+    const input = make("input");
+    input.type = "file";
+    input.multiple = true;
+    return new Promise((resolve) => {
+      input.addEventListener("cancel", () => resolve(null));
+      input.addEventListener("change", () => resolve(awaited(this._sentAll([...input.files || []]))));
+      input.click();
+    });
+  }
+
+  // Returns a section with a file and parameters that the user chooses, or null.
+  /** @type {(choice: Choice) => Promise<any>} */
+  async chooseSection({ label, value, file, required = [], optional = [] }) {
+    const path = await this.choose(), names = [...required, ...optional];
+    if (!path) return null;
+    if (!names.length) return { ...value, [String(file)]: path };
+    const form = $("parameters-form"), field = $("parameters-text");
+    $("parameters-title").textContent = label.replaceAll("_", " ") + ": " + path.split("/").pop();
+    $("parameters-names").textContent = "Parameters: " + names.join(", ");
+    field.value = this.typed.get(label) ?? required.map((name) => name + ": ").join("\n");
+    $("parameters-error").textContent = "";
+    $("parameters-dialog").returnValue = "";
+    $("parameters-dialog").showModal();
+    return new Promise((resolve) => {
+      const end = new AbortController(), { signal } = end;
+      form.addEventListener("submit", (event) => {
+        if (event.submitter?.getAttribute("value") !== "use") return;
+        const { found, problem } = parametersOf(field.value, names, required);
+        $("parameters-error").textContent = problem;
+        if (problem) event.preventDefault();
+        else {
+          this.typed.set(label, field.value);
+          end.abort();
+          resolve({ ...value, ...found, [String(file)]: path });
+        }
+      }, { signal });
+      $("parameters-dialog").addEventListener("close", () => { end.abort(); resolve(null); }, { signal });
+    });
+  }
+
+  async _sentAll(files) {
+    const first = files.find(isIndex) ?? files[0];
+    /** @type {string | null} */
+    let found = null;
+    for (const file of files) {
+      const path = await this._sent(file);
+      if (!path) return null;
+      if (file === first) found = path;
     }
-    const use = useOf(file.name), { path } = answer;
-    if (use === "video") this.connection.send({ do: "video", path });
-    else this.connection.send(use === "gaze" ? { do: "gaze_file", path } : { do: "file", path, as: use });
+    this.on.busy(null);
+    return found;
   }
 
   // Asks before saved settings are replaced.

@@ -780,6 +780,7 @@ function start() {
     reset: (key) => connection.send({ do: "reset", key }),
     remove: (key) => connection.send({ do: "delete", key }),
     act: (what, name) => connection.send({ do: what, name }),
+    chooseFile: () => files.choose(), chooseSection: (choice) => files.chooseSection(choice),
   });
   createEditor();
   const scene = () => [...controls.rows.values()].find(({ control: { key, kind } }) => key === "scene" && kind === "choice");
