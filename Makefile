@@ -22,11 +22,13 @@ UV := $(LOWEST)/uv/bin/uv
 EFFORT ?= all
 # PyTorch has a separate environment, since its wheel may install gigabytes of CUDA libraries.
 TORCH_VENV ?= .venv-torch
+# So have the programs whose files are read.
+INTEROP_VENV ?= .venv-interop
 CHECK_PYTHON = command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found; specify one with: make PYTHON=..."; exit 1; }; \
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	{ echo "foveasim requires Python 3.11 or later; specify one with: make PYTHON=python3.12"; exit 1; }
 
-.PHONY: demo test test-all test-nightly test-pages test-core test-lowest test-torch soak lint lint-js bench bench-torch peers docs clean
+.PHONY: demo test test-all test-nightly test-pages test-core test-lowest test-torch test-interop soak lint lint-js bench bench-torch peers docs clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.installed
@@ -69,6 +71,11 @@ test-torch: $(TORCH_VENV)/.installed
 	FOVEASIM_TESTS=$(EFFORT) FOVEASIM_TESTS_NEED=torch,deepinv,torchvision $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) tests/test_docs.py \
 		tests/test_doctests.py tests/test_gallery.py tests/test_notebooks.py tests/installation -k "torch or learn or adapters" $(PYTEST_ARGS)
 
+# Files of other programs, which these write and read.
+test-interop: $(INTEROP_VENV)/.installed
+	FOVEASIM_TESTS=all FOVEASIM_TESTS_NEED=interop $(INTEROP_VENV)/bin/python -m pytest $(PARALLEL) tests/interop \
+		tests/distortion/test_calibration_files.py $(PYTEST_ARGS)
+
 # Kills workers at random for some minutes: every item must be computed, or have lost its worker three times.
 soak: $(VENV)/.installed-dev
 	FOVEASIM_SOAK_ROUNDS=20 $(BIN)/python -m pytest tests/explore/test_executor.py -k lost --verbose $(PYTEST_ARGS)
@@ -102,10 +109,10 @@ docs: $(VENV)/.installed-docs
 	@echo "open docs/_build/html/index.html"
 
 clean:
-	rm -rf $(VENV) $(LOWEST) $(TORCH_VENV) out docs/_build docs/gallery docs/layouts docs/reference node_modules .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST) $(TORCH_VENV) $(INTEROP_VENV) out docs/_build docs/gallery docs/layouts docs/reference node_modules .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find foveasim tests -name __pycache__ -type d -exec rm -rf {} +
 
-$(VENV)/.made $(LOWEST)/uv/.made $(TORCH_VENV)/.made:
+$(VENV)/.made $(LOWEST)/uv/.made $(TORCH_VENV)/.made $(INTEROP_VENV)/.made:
 	@$(CHECK_PYTHON)
 	$(PYTHON) -m venv $(@D) || { rm -rf $(@D); exit 1; }
 	touch $@
@@ -141,4 +148,9 @@ $(TORCH_VENV)/.installed: $(TORCH_VENV)/.made pyproject.toml
 	@echo "installing foveasim and PyTorch into $(TORCH_VENV) (minutes with CUDA)"
 	$(TORCH_VENV)/bin/python $(INSTALL) --editable '.[adapters,explore,layout,learn]' hypothesis ipykernel nbclient onnxruntime onnxscript pytest \
 		pytest-timeout pytest-xdist
+	touch $@
+
+$(INTEROP_VENV)/.installed: $(INTEROP_VENV)/.made pyproject.toml
+	@echo "installing foveasim and the programs whose files it reads into $(INTEROP_VENV) (minutes)"
+	$(INTEROP_VENV)/bin/python $(INSTALL) --editable '.[interop]'
 	touch $@

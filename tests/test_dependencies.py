@@ -40,14 +40,14 @@ EXTRAS = {
 #: Extras of what is not part of the package.
 FOLDERS = {
     "tests": {"dev"},
+    "tests/interop": {"interop"},
     "benchmarks": {"dev", "learn", "peers"},
     "gallery": {"dev", "learn"},
     "docs": {"docs", "learn"},
 }
-#: What may name PyTorch or gdsfactory: the only tests that run where they are installed, and the check whether they are.
+#: What may name PyTorch: the only tests that run where it is installed, and the check whether it is.
 OPTIONAL_TESTS = {
     ROOT / "tests" / "explore" / "test_dataset_torch.py",
-    ROOT / "tests" / "layout" / "files" / "test_chip_files_gdsfactory.py",
     ROOT / "tests" / "conftest.py",
     *(ROOT / "tests" / "learn").rglob("*.py"),
 }
@@ -59,7 +59,7 @@ INDIRECT = {
     "websockets": "uvicorn serves sockets with it",
 }
 #: Functions that take the name of a module.
-IMPORTING = {"__import__", "_imported", "find_spec", "import_module", "import_optional", "importorskip"}
+IMPORTING = {"__import__", "_imported", "find_spec", "import_module", "import_optional", "importorskip", "other_program"}
 
 
 def normalised(name):
@@ -148,7 +148,8 @@ def test_imports_of_package_are_declared():
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_imports_of_folders_are_declared(folder):
-    paths = sorted(set((ROOT / folder).rglob("*.py")) - OPTIONAL_TESTS)
+    inner = {path for name in FOLDERS if name.startswith(f"{folder}/") for path in (ROOT / name).rglob("*.py")}
+    paths = sorted(set((ROOT / folder).rglob("*.py")) - OPTIONAL_TESTS - inner)
     found = {path: undeclared_imports(path, FOLDERS[folder]) for path in paths}
 
     assert found

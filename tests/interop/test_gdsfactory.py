@@ -1,13 +1,13 @@
-"""Chip files in gdsfactory, where it is installed: cells, layers, numbers and columns survive."""
+"""Chip files in gdsfactory: cells, layers, numbers and columns survive."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
+from other_programs import other_program
 
 import foveasim as fs
 
-gf = pytest.importorskip("gdsfactory")
+gf = other_program("gdsfactory")
 
 
 def test_gdsfactory_preserves_cells_and_sites(tmp_path):
