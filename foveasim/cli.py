@@ -66,6 +66,14 @@ Channels = Annotated[
 ]
 Cell = Annotated[str | None, typer.Option("--cell", help="Cell of a GDSII or OASIS file.")]
 Centre = Annotated[bool, typer.Option("--centre", help="Move the centre of the layout to the origin.")]
+Reading = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--reading",
+        help="Other options of a GDSII or OASIS file: invalid=skip, duplicates=rename, missing=skip, circle_tolerance=1e-4; "
+        "repeatable.",
+    ),
+]
 FramesPerS = Annotated[float | None, typer.Option("--fps", help="Frame rate in frames per second.")]
 Threads = Annotated[int | None, typer.Option("--threads", help="Number of threads; one per core by default.")]
 Workers = Annotated[int | None, typer.Option("--workers", help="Number of worker processes; one per core by default.")]
@@ -110,6 +118,7 @@ def run(
     channels: Channels = None,
     cell: Cell = None,
     centre: Centre = False,
+    reading: Reading = None,
     out: Out = Path("out"),
     threads: Threads = None,
     require: Annotated[
@@ -119,7 +128,9 @@ def run(
     """Simulate the shot of a settings file, and check its requirements."""
     if any(change.partition("=")[0].strip().startswith("gaze_path") for change in changes or []):
         _exit("error: --set gaze_path: only videos follow a path; use gaze_um, or foveasim video", BAD_INPUT)
-    (result,) = _run([settings], [*(changes or []), *_layout_changes(layer, channels, cell, centre)], out, threads)
+    (result,) = _run(
+        [settings], [*(changes or []), *_layout_changes(layer, channels, cell, centre, reading)], out, threads
+    )
     if require and not result.shot.requirements:
         _exit(f"error: {settings}: contains no requirements", BAD_INPUT)
     if result.shot.requirements:
@@ -146,6 +157,7 @@ def check(
     channels: Channels = None,
     cell: Cell = None,
     centre: Centre = False,
+    reading: Reading = None,
     report_file: Annotated[
         Path | None, typer.Option("--report", help="Write the violations to a KLayout report database (.lyrdb).")
     ] = None,
@@ -153,7 +165,7 @@ def check(
     """Check a layout against design rules; exit with 1 on violations."""
     from foveasim.config import read_any_layout, read_rules
 
-    file = read_any_layout(layout, **_reading_options(layer, channels, cell, centre))
+    file = read_any_layout(layout, **_reading_options(layer, channels, cell, centre, reading))
     limits = file.rules if rules is None else read_rules(rules)
     if limits is None:
         _exit(f"error: {layout}: contains no design rules; specify them with --rules", BAD_INPUT)
@@ -224,6 +236,7 @@ def describe(
     channels: Channels = None,
     cell: Cell = None,
     centre: Centre = False,
+    reading: Reading = None,
     frames_per_s: FramesPerS = None,
     bits: Annotated[int, typer.Option("--bits", help="Bit depth of the codes.")] = 10,
     blanking: Annotated[float, typer.Option("--blanking", help="Blanking time over readout time.")] = 0.0,
@@ -237,7 +250,7 @@ def describe(
     readout = None
     if frames_per_s is not None:
         readout = Readout(frames_per_s=frames_per_s, bits=bits, blanking=blanking, n_lanes=lanes)
-    found = read_any_layout(layout, **_reading_options(layer, channels, cell, centre))
+    found = read_any_layout(layout, **_reading_options(layer, channels, cell, centre, reading))
     if str(layout) in bundled_layouts() and not layout.exists():
         console.print(first_comment(bundled_layouts()[str(layout)]))
     console.print(found.layout.describe(readout))
@@ -267,8 +280,15 @@ def convert(
     ] = None,
     channels: Channels = None,
     centre: Centre = False,
+    reading: Reading = None,
     dbu_um: Annotated[
         float | None, typer.Option("--dbu-um", help="Database unit of a GDSII or OASIS file in µm.")
+    ] = None,
+    max_vertices: Annotated[
+        int | None,
+        typer.Option(
+            "--max-vertices", help="Maximum vertices of a polygon in a GDSII or OASIS file; others are divided."
+        ),
     ] = None,
     invalid: Annotated[
         str | None,
@@ -280,9 +300,11 @@ def convert(
     from foveasim.layout import write_layout
     from foveasim.layout.files import layer_options
 
-    options = _reading_options(source_layer, channels, source_cell, centre)
-    layout = read_any_layout(source, invalid=invalid, **options).layout
-    written = write_layout(layout, target, dbu_um=dbu_um, **layer_options(layer or [], layers))
+    options = _reading_options(source_layer, channels, source_cell, centre, reading)
+    layout = read_any_layout(source, **({} if invalid is None else {"invalid": invalid}) | options).layout
+    written = write_layout(
+        layout, target, dbu_um=dbu_um, max_vertices=max_vertices, **layer_options(layer or [], layers)
+    )
     dropped = f"; dropped columns: {', '.join(written.dropped_columns)}" if written.dropped_columns else ""
     _report(
         f"wrote {written.path}: {written.n_sites:,} photosites, vertices moved by at most "
@@ -306,6 +328,7 @@ def view(
     channels: Channels = None,
     cell: Cell = None,
     centre: Centre = False,
+    reading: Reading = None,
     rules: Annotated[
         Path | None, typer.Option("--rules", help="Design rules to check: a YAML file or the name of a preset.")
     ] = None,
@@ -328,7 +351,7 @@ def view(
     if solid and (rules is not None or layout is not None):
         _exit("error: --solid shows no violations; omit --rules and --layout", BAD_INPUT)
     with _status("reading"):
-        options = _reading_options(layer, channels, cell, centre)
+        options = _reading_options(layer, channels, cell, centre, reading)
         viewable = read_viewable(file, layout=layout, rules=rules, **options)
     with _status("writing the page"):
         flat = None if solid else web_page(viewable.data, report=viewable.report, name=viewable.name)
@@ -353,6 +376,7 @@ def studio(
     channels: Channels = None,
     cell: Cell = None,
     centre: Centre = False,
+    reading: Reading = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Directory for saved files; without it none are written.")
     ] = None,
@@ -374,7 +398,7 @@ def studio(
         if browser and not is_opened and len(announced) == 1:
             _print("no browser found; open the address in one")
 
-    changes = [*(changes or []), *_layout_changes(layer, channels, cell, centre)]
+    changes = [*(changes or []), *_layout_changes(layer, channels, cell, centre, reading)]
     run_studio(shot, changes=changes, out=out, host=host, port=port, open_browser=browser, announce=announce)
 
 
@@ -400,6 +424,7 @@ def compare(
     channels: Channels = None,
     cell: Cell = None,
     centre: Centre = False,
+    reading: Reading = None,
     exposure_s: Annotated[float | None, typer.Option("--exposure-s", help="Exposure time in seconds.")] = None,
     frames_per_s: FramesPerS = None,
     max_pixels: Annotated[int, typer.Option("--pixels", help="Longer side of the pictures.")] = 256,
@@ -419,7 +444,7 @@ def compare(
             budget=None if budget == "none" else budget,
             tolerance=tolerance,
             exposure_s=exposure_s,
-            layout_options=_reading_options(layer, channels, cell, centre),
+            layout_options=_reading_options(layer, channels, cell, centre, reading),
             frames_per_s=frames_per_s,
             max_pixels=max_pixels,
             n_annuli=annuli,
@@ -636,18 +661,26 @@ def new(
 
 
 def _reading_options(
-    layer: Sequence[str] | None, channels: Sequence[str] | None, cell: str | None, centre: bool
+    layer: Sequence[str] | None,
+    channels: Sequence[str] | None,
+    cell: str | None,
+    centre: bool,
+    reading: Sequence[str] | None,
 ) -> dict[str, Any]:
     from foveasim.layout.files import reading_options
 
-    return reading_options(layer=layer or (), channels=channels or (), cell=cell, centre=centre)
+    return reading_options(layer=layer or (), channels=channels or (), cell=cell, centre=centre, further=reading or ())
 
 
 def _layout_changes(
-    layer: Sequence[str] | None, channels: Sequence[str] | None, cell: str | None, centre: bool
+    layer: Sequence[str] | None,
+    channels: Sequence[str] | None,
+    cell: str | None,
+    centre: bool,
+    reading: Sequence[str] | None,
 ) -> list[str]:
     """Return the options as changes of the layout's settings."""
-    options = _reading_options(layer, channels, cell, centre)
+    options = _reading_options(layer, channels, cell, centre, reading)
     return [f"layout.{name}={json.dumps(value)}" for name, value in options.items()]
 
 

@@ -111,14 +111,18 @@ def _import(name: str) -> Any:
 
 def _load(task: dict[str, Any]) -> Any:
     """Return the reader of a task, with its keywords."""
-    if task["file"] is None:
+    if not task["files"]:
         return functools.partial(getattr(_import(task["module"]), task["reader"]), task["path"], **task["args"])
-    spec = importlib.util.spec_from_file_location(task["module"], task["file"])
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return functools.partial(getattr(module, task["reader"]), task["path"], limit=limit, **task["args"])
+    for name, file in task["files"]:
+        spec = importlib.util.spec_from_file_location(name, file)
+        assert spec is not None
+        assert spec.loader is not None
+        # Under its name, so that the next module can import from it without its package.
+        sys.modules[name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[name])
+    return functools.partial(
+        getattr(sys.modules[task["module"]], task["reader"]), task["path"], limit=limit, **task["args"]
+    )
 
 
 def _run_reader(task: dict[str, Any], answer: BinaryIO) -> dict[str, Any]:

@@ -20,9 +20,10 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import ModuleType
 from typing import IO, Any
 
 import numpy as np
@@ -97,20 +98,23 @@ def run_in_sandbox(
     max_bytes: int,
     is_silent: bool = False,
     is_standalone: bool = False,
+    parts: Sequence[ModuleType] = (),
 ) -> ReaderResult:
     """
     Run a reader in the sandbox process, with given limits.
 
     ``reader``, ``path``, ``kind``, ``is_silent``: as in :func:`read_in_sandbox`. ``args``: keywords of the reader, plain data.
     ``max_cpu_s`` (int, s): processor time limit; the wall time limit is ``WALL_TIME_FACTOR`` times as long. ``max_bytes``:
-    limit of the address space. ``is_standalone``: whether the module of the reader imports no other module of the package. It
-    is then loaded without the package, which is faster and needs less memory, and the reader receives the keyword ``limit``,
-    the function that sets resource limits. Raises FileError as in :func:`read_in_sandbox`.
+    limit of the address space. ``is_standalone``: whether the module of the reader imports no other module of the package than
+    ``parts``, which import none. It is then loaded without the package, which is faster and needs less memory, and the reader
+    receives the keyword ``limit``, the function that sets resource limits. Raises FileError as in :func:`read_in_sandbox`.
     """
     with tempfile.TemporaryDirectory(prefix="foveasim-", ignore_cleanup_errors=True) as directory:
         arrays, printed = Path(directory) / "arrays.npy", Path(directory) / "printed.txt"
         files = {
-            "file": sys.modules[reader.__module__].__file__ if is_standalone else None,
+            "files": [(m.__name__, m.__file__) for m in (*parts, sys.modules[reader.__module__])]
+            if is_standalone
+            else [],
             "arrays": str(arrays),
             "printed": str(printed),
         }
@@ -174,7 +178,7 @@ def iterate_in_sandbox(
     fails, crashes or exceeds a limit.
     """
     task = _task(
-        reader, path, args, file=None, is_iterator=True, printed=os.devnull, max_cpu_s=None, max_bytes=max_bytes
+        reader, path, args, files=[], is_iterator=True, printed=os.devnull, max_cpu_s=None, max_bytes=max_bytes
     )
     process = _start(task, subprocess.PIPE, tempfile.gettempdir())
     assert process.stdout is not None

@@ -159,6 +159,9 @@ FILE_OPTIONS: dict[str, Any] = {
     "channels": dict[str, int | str] | None,
     "filter_names": list[str] | None,
     "invalid": Literal["error", "skip", "repair"] | None,
+    "duplicates": Literal["error", "rename"] | None,
+    "missing": Literal["error", "skip"] | None,
+    "circle_tolerance": float | None,
     "centre": bool | None,
 }
 #: Parameters of scenes from arrays.

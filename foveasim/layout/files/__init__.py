@@ -64,6 +64,9 @@ def read_layout(
     channels: Mapping[Any, int | str] | None = None,
     filter_names: Sequence[str] | None = None,
     invalid: Literal["error", "skip", "repair"] | None = None,
+    duplicates: Literal["error", "rename"] | None = None,
+    missing: Literal["error", "skip"] | None = None,
+    circle_tolerance: Annotated[float | None, Limits(at_least=1e-6, at_most=0.03)] = None,
     centre: bool | None = None,
     **options: Any,
 ) -> Layout:
@@ -91,7 +94,16 @@ def read_layout(
     invalid : {"error", "skip", "repair"}, optional
         GDSII and OASIS: outlines that are not simple polygons, because they cross themselves or have no area, are an error by
         default, which lists all of them with their positions. ``"skip"`` reads the others. ``"repair"`` also divides an outline
-        where it crosses itself, and reads the largest part.
+        where it crosses itself, and reads the largest part. The parts of an outline that only touches itself are sites with the
+        same ``site_id``.
+    duplicates : {"error", "rename"}, optional
+        GDSII and OASIS: several cells of one name are an error by default. ``"rename"`` reads all of them: a further cell ``A``
+        is ``A$1``, or one with equal content is omitted. References that do not tell different cells apart remain an error.
+    missing : {"error", "skip"}, optional
+        GDSII and OASIS: references to cells that the file does not contain are an error by default, or skipped.
+    circle_tolerance : float, optional
+        GDSII and OASIS: largest distance between a circle and its outline, relative to the radius, by default 1e-3. The area is
+        that of the circle. Applies to discs and to round ends of paths.
     centre : bool, optional
         Whether to move the centre of the layout's bounding box to the origin.
     **options
@@ -114,7 +126,8 @@ def read_layout(
     Warns
     -----
     LayoutWarning
-        When invalid outlines are skipped or repaired; the message lists them with their positions.
+        When invalid outlines are skipped or repaired, missing cells are skipped or cells renamed; the message lists them. When
+        records of a file have a meaning that other programs do not support either, such as absolute magnifications.
 
     Examples
     --------
@@ -127,8 +140,14 @@ def read_layout(
         raise FileError(path, "no such file; foveasim.read_layout reads the bundled layout of this name")
     _, found = detect_format(path, FORMATS, "layout file")
     assert found.read is not None
-    given = {"layer": layer, "cell": cell, "layers": layers, "channels": channels, "filter_names": filter_names}
-    given["invalid"] = invalid
+    given: dict[str, Any] = {
+        "layer": layer,
+        "cell": cell,
+        "layers": layers,
+        "channels": channels,
+        "filter_names": filter_names,
+    }
+    given |= {"invalid": invalid, "duplicates": duplicates, "missing": missing, "circle_tolerance": circle_tolerance}
     chosen = validate_options(given | options, found.read_options, FORMATS, "read_options")
     with as_file_error(path, f"{found.title} layout", passes=(FoveasimError,)):
         layout: Layout = found.read(path, **chosen)
@@ -154,6 +173,7 @@ def write_layout(
     filter_names: Sequence[str] | None = None,
     dbu_um: Annotated[float | None, Limits(at_least=1e-9, at_most=1e3)] = None,
     hierarchy: bool | None = None,
+    max_vertices: Annotated[int | None, Limits(at_least=4, at_most=1_000_000)] = None,
     colours: Mapping[int, str] | None = None,
     **options: Any,
 ) -> WrittenLayout:
@@ -180,6 +200,10 @@ def write_layout(
     hierarchy : bool, optional
         GDSII and OASIS: whether congruent sites are references to a cell, and regular ones arrays, by default True. Otherwise
         each site is a polygon in the top cell.
+    max_vertices : int, optional
+        GDSII and OASIS: maximum vertices of a polygon, for programs that read no larger ones; in GDSII at most 8189, which is
+        the default there. Outlines with more, and with holes, are divided into parts, which become one site again on
+        reading.
     colours : mapping of int to str, optional
         SVG: colour of each channel, such as ``{0: "#c23b22", 1: "green"}``; other channels are grey.
     **options
@@ -197,7 +221,8 @@ def write_layout(
     ParameterError
         When an option does not belong to the format, or the format does not support a column or a channel.
     GeometryError
-        When sites, or shapes derived from them, vanish, collapse or self-intersect on the database grid.
+        When sites, or shapes derived from them, vanish, collapse or self-intersect on the database grid, or have more vertices
+        than a layout of a file may have.
 
     Warns
     -----
@@ -221,6 +246,7 @@ def write_layout(
         "filter_names": filter_names,
         "dbu_um": dbu_um,
         "hierarchy": hierarchy,
+        "max_vertices": max_vertices,
         "colours": colours,
         **options,
     }

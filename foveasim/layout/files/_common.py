@@ -107,6 +107,11 @@ def check_site_count(path: Path, n_sites: int) -> None:
         raise FileError(path, f"has {n_sites} sites, more than the maximum of {MAX_SITES}")
 
 
+def check_readable(layout: Layout) -> None:
+    """Reject a layout with more rings or vertices of a site than are read from a file."""
+    check_sizes(np.diff(layout.site_offsets), np.diff(layout.ring_offsets[layout.site_offsets]))
+
+
 def layout_from_untrusted(
     polygons: NDArray[Any] | tuple[NDArray[Any], NDArray[Any], NDArray[Any]],
     columns: Mapping[str, NDArray[Any]],

@@ -1,7 +1,7 @@
 """
 Flattened polygons of GDSII and OASIS files, read by gdstk in the sandbox process.
 
-The module imports no other module of the package, which makes the process start quickly.
+The module imports only one other module of the package, which imports none: the process starts quickly.
 """
 
 from __future__ import annotations
@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-#: Prefix of cells that KLayout adds for its own metadata.
+from foveasim.layout.files._paths import CIRCLE_TOLERANCE, disc, n_vertices_of_disc, path_outline
+
+#: Prefix of cells with the metadata of KLayout: their references and shapes only carry properties.
 KLAYOUT_METADATA = "$$$CONTEXT_INFO$$$"
 #: Number of names in a message.
 MAX_LISTED = 5
@@ -35,6 +37,12 @@ MAX_SITE = 10**9
 #: Maximum number of names and values of a shape's columns, and maximum length of their string.
 MAX_WORDS = 128
 MAX_CHARS = 1024
+#: Vertices of paths and circles are not on the database grid; those within this distance are.
+SAME_DBU = 1e-6
+#: Tolerance with which gdstk approximates circles by few vertices.
+MAX_TOLERANCE_UM = 1e9
+#: Beginning of the warning of gdstk that a cell is missing.
+MISSING_REFERENCE = "Missing reference"
 
 
 class FormatError(Exception):
@@ -105,6 +113,11 @@ def read(
     max_memory_bytes: int,
     max_text_bytes: int,
     max_cpu_s: int,
+    source: str | None = None,
+    circles: str | None = None,
+    ambiguous: Sequence[str] = (),
+    missing: str = "error",
+    circle_tolerance: float = CIRCLE_TOLERANCE,
 ) -> tuple[dict[str, Any], list[Any]]:
     """
     Read a cell with its complete hierarchy.
@@ -112,39 +125,50 @@ def read(
     ``limit``: function that sets limits of memory and processor time. Tighter limits apply while gdstk reads the file.
     ``layers``: layers of the photosites; a datatype of None stands for all. ``filters``: layers of the colour filters.
     ``cell``: cell selected by the user. ``max_sites``, ``max_memory_bytes``, ``max_text_bytes``, ``max_cpu_s``: limits of the
-    flattened content. Returns ``about``: database unit ``dbu_um``, name ``cell``, and ``layers`` of the photosites.
-    ``arrays``: ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`) of the photosites, the text of their
-    columns, and the same three arrays of the filters without the outline of a photosite.
+    flattened content. ``source``, ``circles``: files with the edited content and with the circles, see
+    :class:`foveasim.layout.files._source.Source`. ``ambiguous``: names that several cells had. ``missing``: ``"skip"`` ignores
+    references to cells that the file does not contain. ``circle_tolerance``: of discs and round ends.
+
+    Returns ``about``: database unit ``dbu_um``, name ``cell``, ``layers`` of the photosites, names of ``missing`` cells, and
+    whether there are ``arcs``. ``arrays``: ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`) of the
+    photosites, the text of their columns, and the same three arrays of the filters without the outline of a photosite.
     """
     import gdstk
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        library = (gdstk.read_oas if is_oasis else gdstk.read_gds)(path)
-    if is_oasis and caught:
-        # gdstk drops the rest of an OASIS file after an unknown record; GDSII records contain their lengths.
-        raise FormatError(f"is corrupt, or contains elements that gdstk does not support ({caught[0].message})")
+        # The tolerance of gdstk is an absolute one; circles are replaced below.
+        library = (gdstk.read_oas if is_oasis else gdstk.read_gds)(source or path, tolerance=MAX_TOLERANCE_UM)
+    problems = [str(w.message) for w in caught if not str(w.message).startswith(MISSING_REFERENCE)]
+    if is_oasis and problems:
+        # gdstk drops the rest of an OASIS file after a problem.
+        raise FormatError(f"is corrupt: gdstk stops with {problems[0]!r}")
     dbu_um = library.precision * 1e6
     if not (math.isfinite(dbu_um) and 1e-9 <= dbu_um <= 1e3 and 1e-12 <= library.unit <= 1.0):
         raise FormatError(f"has the invalid database unit {dbu_um:g} µm")
-    cells = {cell.name: cell for cell in library.cells}
+    radii = _radii(circles)
+    radii_of = {cell.name: radii.get(k, {}) for k, cell in enumerate(library.cells)}
+    cells = {cell.name: cell for cell in library.cells if not cell.name.startswith(KLAYOUT_METADATA)}
+    children = _Children(cells, set(ambiguous), is_skipped=missing == "skip")
     top = _top_cell(cells, cell)
-    order = _post_order(cells, top)
+    order = _post_order(children, top)
     found = _layers_with_shapes(cells, order)
     layers = _layers_of_sites(found, layers, filters)
     is_site = {key for key in found if _last_match(key, layers) >= 0}
     filter_of = {key: k for key in found if (k := _last_match(key, filters)) >= 0}
-    selected = {name: _Selected(cells[name], is_site, filter_of) for name in order}
-    _check_numbers(cells, order, selected, max_sites, max_memory_bytes)
+    arcs = _Arcs(library.unit * 1e6 / dbu_um, n_vertices_of_disc(circle_tolerance))
+    selected = {name: _Selected(cells[name], is_site, filter_of, radii_of[name], arcs) for name in order}
+    _check_numbers(children, order, selected, max_sites, max_memory_bytes)
     # Memory and time of the following steps are bounded.
     limit("RLIMIT_AS", max_memory_bytes)
     limit("RLIMIT_CPU", max_cpu_s)
     flat: dict[str, Shapes] = {}
     lines: list[str] = []
-    last_use = {child: name for name in order for child in _children(cells, name)}
+    last_use = {child: name for name in order for child in children.of(name)}
     for name in order:
-        flat[name] = _flatten(cells[name], selected.pop(name), flat, lines, library.unit * 1e6, dbu_um)
-        for child in _children(cells, name):
+        references = children.references(name)
+        flat[name] = _flatten(references, selected.pop(name), flat, lines, library.unit * 1e6, dbu_um)
+        for child in children.of(name):
             if last_use[child] == name:
                 del flat[child]
     is_on_site_layer = np.isin(
@@ -152,7 +176,13 @@ def read(
     )
     sites, covers = flat[top].select(is_on_site_layer), flat[top].select(~is_on_site_layer)
     text = _column_lines(sites, lines, max_text_bytes)
-    about = {"dbu_um": dbu_um, "cell": top, "layers": layers}
+    about = {
+        "dbu_um": dbu_um,
+        "cell": top,
+        "layers": layers,
+        "missing": sorted(children.missing),
+        "arcs": arcs.are_used,
+    }
     return about, [sites.xy, sites.counts, sites.tags, text, covers.xy, covers.counts, covers.tags]
 
 
@@ -230,7 +260,7 @@ def _top_cell(cells: dict[str, Any], wanted: str | None) -> str:
             raise FormatError(f"has no cell {wanted!r}; {hint}possible: {_format_names(f'{n!r:.40}' for n in cells)}")
         return wanted
     below = {reference.cell_name for cell in cells.values() for reference in cell.references}
-    tops = [n for n, c in cells.items() if n not in below and not n.startswith(KLAYOUT_METADATA)]
+    tops = [n for n in cells if n not in below]
     if len(tops) > 1:
         tops = [n for n in tops if cells[n].polygons or cells[n].paths or cells[n].references] or tops[:1]
     if not tops:
@@ -240,11 +270,45 @@ def _top_cell(cells: dict[str, Any], wanted: str | None) -> str:
     return tops[0]
 
 
-def _post_order(cells: dict[str, Any], top: str) -> list[str]:
+class _Children:
+    """
+    References between the cells, without those to missing ones if these ``are_skipped``.
+
+    ``missing``: names of the missing cells so far.
+    """
+
+    def __init__(self, cells: dict[str, Any], ambiguous: set[str], *, is_skipped: bool) -> None:
+        self.cells, self.ambiguous, self.is_skipped = cells, ambiguous, is_skipped
+        self.missing: set[str] = set()
+
+    def references(self, name: str) -> list[Any]:
+        """Return the references of a cell to other cells."""
+        return [r for r in self.cells[name].references if r.cell_name in self.cells]
+
+    def of(self, name: str) -> Iterator[str]:
+        """Yield the names of the cells that a cell contains."""
+        for child in dict.fromkeys(reference.cell_name for reference in self.cells[name].references):
+            if child in self.cells:
+                if child in self.ambiguous:
+                    raise FormatError(
+                        f"references the cell {child!r:.40} in {name!r:.40}, but contains several different cells of this "
+                        "name; give each its own name"
+                    )
+                yield child
+            elif self.is_skipped:
+                self.missing.add(child)
+            else:
+                raise FormatError(
+                    f"references the cell {child!r:.40} in {name!r:.40}, which it does not contain; add the cell, or pass "
+                    "missing='skip' to read the others"
+                )
+
+
+def _post_order(cells: _Children, top: str) -> list[str]:
     """Return the names of a cell and its hierarchy, subcells before their parents."""
     order: list[str] = []
     is_open = {top: True}
-    stack: list[tuple[str, Iterator[str]]] = [(top, _children(cells, top))]
+    stack: list[tuple[str, Iterator[str]]] = [(top, cells.of(top))]
     while stack:
         name, children = stack[-1]
         child = next(children, None)
@@ -254,37 +318,92 @@ def _post_order(cells: dict[str, Any], top: str) -> list[str]:
             is_open[name] = False
         elif child not in is_open:
             is_open[child] = True
-            stack.append((child, _children(cells, child)))
+            stack.append((child, cells.of(child)))
         elif is_open[child]:
             raise FormatError(f"has a cell that contains itself, {child!r}")
     return order
 
 
-def _children(cells: dict[str, Any], name: str) -> Iterator[str]:
-    for child in dict.fromkeys(reference.cell_name for reference in cells[name].references):
-        if child not in cells:
-            raise FormatError(f"references the cell {child!r}, which it does not contain")
-        yield child
+def _radii(file: str | None) -> dict[int, dict[int, int]]:
+    """Return the radii of the circles, in database units, by cell and index of the polygon."""
+    radii: dict[int, dict[int, int]] = {}
+    if file is not None:
+        for cell, polygon, radius in np.load(file, allow_pickle=False).tolist():
+            radii.setdefault(cell, {})[polygon] = radius
+    return radii
+
+
+class _Arcs:
+    """
+    Polygons of paths and of circles.
+
+    ``scale``: database units per unit of gdstk. ``n``: vertices of a disc. ``are_used``: whether an outline has arcs.
+    """
+
+    def __init__(self, scale: float, n: int) -> None:
+        self.scale, self.n, self.are_used = scale, n, False
+
+    def of_path(self, path: Any) -> Any:
+        """Return the polygon of a path, with its repetition and properties."""
+        width = float(np.rint(path.widths()[0, 0] * self.scale))
+        end = path.ends[0]
+        ends: tuple[float, float] | None = None
+        if end == "round":
+            self.are_used = True
+        elif isinstance(end, str):
+            ends = (0.0, 0.0) if end == "flush" else (0.5 * width, 0.5 * width)
+        else:
+            ends = (round(end[0] * self.scale), round(end[1] * self.scale))
+        outline = path_outline(np.rint(path.spine() * self.scale), width, ends, self.n)
+        return self._polygon(outline, path, path.layers[0], path.datatypes[0])
+
+    def of_circle(self, polygon: Any, radius: int) -> Any:
+        """Return the polygon of a circle."""
+        self.are_used = True
+        centre = np.rint(polygon.points.mean(axis=0) * self.scale)
+        return self._polygon(disc(centre, radius, self.n), polygon, polygon.layer, polygon.datatype)
+
+    def _polygon(self, outline: NDArray[np.float64], element: Any, layer: int, datatype: int) -> Any:
+        import gdstk
+
+        points: Any = outline / self.scale
+        polygon = gdstk.Polygon(points, layer, datatype)
+        polygon.properties, polygon.repetition = element.properties, element.repetition
+        return polygon
 
 
 class _Selected:
     """
-    Shapes of a cell on the layers of photosites and filters.
+    Shapes of a cell on the layers of photosites and filters, paths and circles as polygons.
 
     A filter with the outline of a photosite in the same cell covers no other photosite. It is not expanded with the
     hierarchy: its index is an attribute of the photosite.
 
-    ``polygons``, ``paths``: the filters that are not attributes follow the photosites. ``filters``: filter of each polygon, -1
-    for none. ``copies``: number of repetitions of each polygon.
+    ``polygons``: the filters that are not attributes follow the photosites. ``filters``: filter of each polygon, -1 for none.
+    ``copies``: number of repetitions of each polygon. ``is_on_grid``: whether all vertices are multiples of the database unit.
     """
 
-    def __init__(self, cell: Any, is_site: set[tuple[int, int]], filter_of: dict[tuple[int, int], int]) -> None:
-        self.polygons = [p for p in cell.polygons if (p.layer, p.datatype) in is_site]
+    def __init__(
+        self,
+        cell: Any,
+        is_site: set[tuple[int, int]],
+        filter_of: dict[tuple[int, int], int],
+        radii: dict[int, int],
+        arcs: _Arcs,
+    ) -> None:
+        layers = is_site | filter_of.keys()
+        polygons = cell.polygons
+        for i, radius in radii.items():
+            if (polygons[i].layer, polygons[i].datatype) in layers:
+                polygons[i] = arcs.of_circle(polygons[i], radius)
+        paths = [p for p in cell.paths if (p.layers[0], p.datatypes[0]) in layers]
+        self.is_on_grid = not radii and not paths
+        polygons += map(arcs.of_path, paths)
+        self.filter_of = filter_of
+        self.polygons = [p for p in polygons if (p.layer, p.datatype) in is_site]
         self.filters = [filter_of.get((p.layer, p.datatype), -1) for p in self.polygons] if filter_of else []
-        self.paths = cell.paths
-        self.is_site, self.filter_of = is_site, filter_of
         if filter_of:
-            self._add_filters([p for p in cell.polygons if (p.layer, p.datatype) in filter_of.keys() - is_site])
+            self._add_filters([p for p in polygons if (p.layer, p.datatype) in filter_of.keys() - is_site])
         else:
             self.filters = [-1] * len(self.polygons)
         self.copies = list(map(_n_copies, self.polygons))
@@ -304,44 +423,29 @@ class _Selected:
                 self.polygons.append(polygon)
                 self.filters.append(-1)
 
-    def outlines_of_paths(self) -> list[Any]:
-        """Return the outlines of the paths on the layers, repetitions included."""
-        outlines = (q for path in self.paths for p in (path, *path.apply_repetition()) for q in p.to_polygons())
-        return [q for q in outlines if (q.layer, q.datatype) in self.is_site | self.filter_of.keys()]
-
     def count_polygons(self) -> int:
-        """Count polygons and paths."""
-        return sum(self.copies) + sum(map(_n_copies, self.paths))
+        """Count polygons, with their repetitions."""
+        return sum(self.copies)
 
-    def count_vertices(self, max_vertices: int) -> int:
-        """
-        Count the vertices of polygons and paths.
-
-        Counting stops when the number exceeds ``max_vertices``, as paths may have very many vertices.
-        """
-        n = sum(p.size * k for p, k in zip(self.polygons, self.copies, strict=True))
-        for path in self.paths:
-            if n > max_vertices:
-                break
-            n += _n_copies(path) * sum(p.size for p in path.to_polygons())
-        return n
+    def count_vertices(self) -> int:
+        """Count the vertices of polygons, with their repetitions."""
+        return sum(p.size * k for p, k in zip(self.polygons, self.copies, strict=True))
 
 
 def _check_numbers(
-    cells: dict[str, Any], order: list[str], selected: dict[str, _Selected], max_sites: int, max_memory_bytes: int
+    cells: _Children, order: list[str], selected: dict[str, _Selected], max_sites: int, max_memory_bytes: int
 ) -> None:
     """Reject a hierarchy that would flatten to too many sites or too much memory or time."""
     n_polygons: dict[str, int] = {}
     n_vertices: dict[str, int] = {}
-    max_vertices = max_memory_bytes // VERTEX_BYTES
     n_copied = 0
     for name in order:
-        references = [(r.cell_name, _n_copies(r)) for r in cells[name].references]
+        references = [(r.cell_name, _n_copies(r)) for r in cells.references(name)]
         n_polygons[name] = selected[name].count_polygons() + sum(k * n_polygons[c] for c, k in references)
         n_copied += n_polygons[name]
         if n_polygons[name] > max_sites or n_copied > MAX_COPY_RATIO * max_sites:
             raise FormatError(f"has more than the maximum of {max_sites} sites")
-        n_vertices[name] = selected[name].count_vertices(max_vertices) + sum(k * n_vertices[c] for c, k in references)
+        n_vertices[name] = selected[name].count_vertices() + sum(k * n_vertices[c] for c, k in references)
         if VERTEX_BYTES * n_vertices[name] + POLYGON_BYTES * n_polygons[name] > max_memory_bytes:
             raise FormatError(
                 f"has more than the maximum for a file of its size: {n_polygons[name]} sites and filters with "
@@ -369,10 +473,10 @@ def _format_names(names: Iterable[str]) -> str:
 
 
 def _flatten(
-    cell: Any, selected: _Selected, flat: dict[str, Shapes], lines: list[str], unit_um: float, dbu_um: float
+    references: list[Any], selected: _Selected, flat: dict[str, Shapes], lines: list[str], unit_um: float, dbu_um: float
 ) -> Shapes:
     """
-    Return the polygons of a cell and its hierarchy, in database units.
+    Return the polygons of a cell and of its references, in database units.
 
     The column strings of the polygons and of numbered references are appended to ``lines``.
     """
@@ -380,7 +484,7 @@ def _flatten(
     n_placements = 1
     groups: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
     numbered: dict[tuple[Any, ...], tuple[list[NDArray[np.float64]], list[NDArray[np.int64]]]] = {}
-    for r in cell.references:
+    for r in references:
         if flat[r.cell_name].counts.size == 0:
             continue
         offsets = np.asarray(r.repetition.get_offsets(), dtype=np.float64).reshape(-1, 2)
@@ -462,7 +566,7 @@ def _rotation(angle_rad: float) -> NDArray[np.float64]:
 
 
 def _shapes_of_cell(selected: _Selected, lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
-    """Return the polygons of one cell, with paths as polygons and repetitions expanded."""
+    """Return the polygons of one cell, with repetitions expanded."""
     polygons, filters = list(selected.polygons), list(selected.filters)
     for i, n in enumerate(selected.copies):
         if n > 1:
@@ -470,15 +574,17 @@ def _shapes_of_cell(selected: _Selected, lines: list[str], unit_um: float, dbu_u
             copies = selected.polygons[i].apply_repetition()
             polygons += copies
             filters += [filters[i]] * len(copies)
-    outlines = selected.outlines_of_paths()
-    polygons += outlines
-    filters += [selected.filter_of.get((q.layer, q.datatype), -1) for q in outlines]
-    points = [p.points for p in polygons]
+    # An outline of fewer vertices has no area, and is an invalid one of the file.
+    points = [p.points if p.size > 2 else np.resize(p.points, (3, 2)) for p in polygons]
     counts = np.fromiter(map(len, points), np.int64, len(points))
     xy = np.concatenate(points) if points else np.zeros((0, 2))
     del points
     xy *= unit_um / dbu_um
-    np.rint(xy, out=xy)
+    if selected.is_on_grid:
+        np.rint(xy, out=xy)
+    else:
+        on_grid = np.rint(xy)
+        np.copyto(xy, on_grid, where=np.abs(xy - on_grid) < SAME_DBU)
     strings = _column_strings(polygons)
     tags = np.zeros((len(polygons), 9), np.int64)
     tags[:, 0] = [p.layer for p in polygons]

@@ -42,6 +42,13 @@ PHOTOSITE = "photosite"
 FILTER = "filter_"
 #: Names of the channels in the order of ``mosaic`` and of the RGB filters of a sensor.
 FILTER_NAMES = ("R", "G", "B", "W")
+#: Options of reading that the command line takes by their names, and the types of their values.
+FURTHER: dict[str, type[str | float]] = {
+    "invalid": str,
+    "duplicates": str,
+    "missing": str,
+    "circle_tolerance": float,
+}
 EXAMPLE = "such as (77, 3) or '77/3'"
 _NUMBERS = re.compile(r"([0-9]{1,9})(?:/([0-9]{1,9}))?")
 
@@ -113,6 +120,7 @@ def reading_options(
     channels: Sequence[str] = (),
     cell: str | None = None,
     centre: bool = False,
+    further: Sequence[str] = (),
 ) -> dict[str, Any]:
     """
     Return options of :func:`foveasim.read_layout` from the words of a command line.
@@ -125,6 +133,8 @@ def reading_options(
         Filter layers with the name or number of their channel, ``10/0=R``; several are separated by commas.
     cell : str, optional
     centre : bool
+    further : sequence of str
+        Other options with their values, ``invalid=skip``: the names in :data:`FURTHER`.
 
     Returns
     -------
@@ -134,7 +144,7 @@ def reading_options(
     Raises
     ------
     ParameterError
-        When a filter layer has no channel.
+        When a filter layer has no channel, or a further option is unknown or has no valid value.
     """
     options = layer_options(layer)
     found: dict[str, int | str] = {}
@@ -144,7 +154,22 @@ def reading_options(
             raise ParameterError("channels", "must be layers with their channel, such as 10/0=R", word)
         found[number] = int(name) if name.isdecimal() else name
     given = {"channels": found or None, "cell": cell, "centre": centre or None}
-    return options | {name: value for name, value in given.items() if value is not None}
+    return options | {name: value for name, value in given.items() if value is not None} | _further_options(further)
+
+
+def _further_options(words: Sequence[str]) -> dict[str, Any]:
+    options: dict[str, Any] = {}
+    for word in words:
+        name, _, text = (part.strip() for part in word.partition("="))
+        if name not in FURTHER:
+            raise ParameterError(
+                "reading", "must be options of GDSII and OASIS files", name, hint=possible_names(name, FURTHER)
+            )
+        try:
+            options[name] = FURTHER[name](text)
+        except ValueError:
+            raise ParameterError(name, "must be a number", text) from None
+    return options
 
 
 def read_layer_map(path: str | Path) -> dict[str, Any]:

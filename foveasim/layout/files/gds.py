@@ -28,7 +28,6 @@ References: Calma, GDSII Stream Format Manual 6.0 (1987); SEMI P39, OASIS.
 from __future__ import annotations
 
 import re
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -41,52 +40,41 @@ import shapely
 from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
-from foveasim._core.names import CHANNEL_LETTERS
 from foveasim._core.rings import SITE_ID, positions_in_runs, site_ids
 from foveasim._core.validation import MAX_SITES, Floats, Ints
 from foveasim._io.atomic import atomic_write
-from foveasim._io.formats import FileFormat, as_file_error
-from foveasim._io.sandbox import WALL_TIME_FACTOR, run_in_sandbox
-from foveasim.errors import FileError, GeometryError, LayoutWarning, ParameterError, warn
+from foveasim._io.formats import FileFormat
+from foveasim.errors import GeometryError, LayoutWarning, ParameterError, warn
 from foveasim.layout.database_grid import DEFAULT_DBU_UM, has_valid_outlines, on_grid, to_um
-from foveasim.layout.files import _gdstk
 from foveasim.layout.files._columns import (
     CHANNEL,
-    MAX_COLUMN_BYTES,
     column_strings,
     linear_text,
-    parse_columns,
     storable_columns,
 )
 from foveasim.layout.files._common import (
     FORMATS,
     WrittenLayout,
-    check_site_count,
-    layout_from_untrusted,
+    check_readable,
     rounding_report,
 )
 from foveasim.layout.files._derived import shapes_of_layout, shapes_of_sites
 from foveasim.layout.files._hierarchy import Arrays, concatenate, congruence_classes, find_arrays, single_sites
-from foveasim.layout.files._holes import hole_free_rings, without_keyholes
+from foveasim.layout.files._holes import hole_free_rings
 from foveasim.layout.files._layers import (
-    FILTER_NAMES,
     MAX_LAYER,
     PHOTOSITE,
     DrawnLayer,
-    LayerNumber,
-    are_colours,
-    parse_channels,
     parse_layer,
     parse_layer_map,
-    parse_selection,
 )
+from foveasim.layout.files._oasis_records import END, OASIS_END_BYTES, OASIS_MAGIC
+from foveasim.layout.files._reading import read
 from foveasim.layout.model import Layout, layout_of
-from foveasim.layout.packed import check_sizes
 
 __all__ = ["GDS_MAGIC", "OASIS_MAGIC", "read", "write"]
 
 GDS_MAGIC = b"\x00\x06\x00\x02"
-OASIS_MAGIC = b"%SEMI-OASIS\r\n"
 
 #: A larger displacement of a vertex by rounding causes a warning; the default database unit displaces by at most 0.71 nm.
 ROUNDING_TOLERANCE_NM = 1.0
@@ -108,31 +96,6 @@ SITE_CELL = "PIXEL"
 #: An array with more vertices, in all of its sites and layers, is written as a reference: it needs fewer bytes.
 MAX_FLAT_VERTICES = 16
 
-#: Limits of the sandbox process: memory while gdstk reads, and in total; column strings; time; larger for large files.
-MIN_READING_BYTES, READING_PER_BYTE = 2**30, 256
-MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 2**32, 256, 2**35
-MIN_STRING_BYTES, STRING_BYTES_PER_BYTE = 2**27, 32
-MAX_CPU_S, BYTES_PER_S = 5, 2**20
-#: GDSII record types by data type: none, bit array, 16-bit, 32-bit, 64-bit floating point, string.
-RECORDS_OF_TYPE = {
-    0: b"\x04\x07\x08\x09\x0a\x0b\x0c\x11\x15\x2d\x38",
-    1: b"\x17\x1a\x26\x34",
-    2: b"\x00\x01\x05\x0d\x0e\x13\x16\x21\x22\x25\x2a\x2b\x2e\x32\x33\x36\x39\x3b",
-    3: b"\x0f\x10\x27\x2f\x30\x31",
-    5: b"\x03\x1b\x1c",
-    6: b"\x02\x06\x12\x19\x1f\x20\x23\x24\x2c\x37\x3a",
-}
-END_OF_LIBRARY = 0x0400
-#: Number of invalid outlines in a message.
-MAX_LISTED_OUTLINES = 50
-#: OASIS: size and type of the END record, which ends the file, and number of the validation scheme CRC-32.
-OASIS_END_BYTES = 256
-OASIS_END = 2
-CRC32_SCHEME = 1
-
-
-# -- writing ----------------------------------------------------------------------------------------------------------
-
 
 def write(
     layout: Layout,
@@ -143,6 +106,7 @@ def write(
     filter_names: Sequence[str] | None = None,
     dbu_um: float = DEFAULT_DBU_UM,
     hierarchy: bool = True,
+    max_vertices: int | None = None,
 ) -> WrittenLayout:
     """
     Write GDSII or OASIS, depending on the extension.
@@ -155,6 +119,7 @@ def write(
     all_drawn = _drawn_layers(layout, layer, layers, filter_names)
     drawn = [d for d in all_drawn if not d.is_of_layout]
     is_oasis = path.suffix.lower() in (".oas", ".oasis")
+    check_readable(layout)
     xy_dbu, snapped = _snap_to_grid(layout, dbu_um)
     report = rounding_report(layout, snapped.xy_um, path)
     if 1e3 * report.max_displacement_um > ROUNDING_TOLERANCE_NM:
@@ -163,7 +128,10 @@ def write(
     if any(d.datatype is None or d.channel is not None for d in drawn):
         stack_of = stack_of * (MAX_LAYER + 1) + layout.channel
     _, first, stack_of = np.unique(stack_of, return_index=True, return_inverse=True)
-    max_vertices = None if is_oasis else MAX_GDS_VERTICES
+    if not is_oasis:
+        max_vertices = MAX_GDS_VERTICES if max_vertices is None else max_vertices
+        if max_vertices > MAX_GDS_VERTICES:
+            raise ParameterError("max_vertices", f"must be <= {MAX_GDS_VERTICES} in GDSII", max_vertices)
     drawing = _draw(layout, snapped, first, origin, drawn, dbu_um, max_vertices)
     columns = _stored_columns(layout, drawn, _site_identity(layout, snapped))
     references, flat = _divide(drawing, stack_of, origin, columns, hierarchy=hierarchy)
@@ -572,348 +540,9 @@ def _snap_to_grid(layout: Layout, dbu_um: float) -> tuple[Ints, Layout]:
 def _check_complete(path: Path, is_oasis: bool) -> None:
     """Check that a file is complete, as gdstk does not report a full disk."""
     data = path.read_bytes()[-OASIS_END_BYTES:]
-    is_complete = data[:1] == bytes([OASIS_END]) if is_oasis else data[-4:] == b"\x00\x04\x04\x00"
+    is_complete = data[:1] == bytes([END]) if is_oasis else data[-4:] == b"\x00\x04\x04\x00"
     if not is_complete:
         raise OSError("the written file is incomplete")
-
-
-# -- reading ----------------------------------------------------------------------------------------------------------
-
-
-def read(
-    path: Path,
-    *,
-    layer: Any = None,
-    cell: str | None = None,
-    layers: Mapping[str, Any] | str | Path | None = None,
-    channels: Mapping[Any, Any] | None = None,
-    filter_names: Sequence[str] | None = None,
-    invalid: str = "error",
-) -> Layout:
-    """
-    Read GDSII or OASIS, detected by content.
-
-    The cell hierarchy is flattened, and the sites are ordered by their numbers. Invalid outlines are an error, which lists all
-    of them, or are skipped or repaired with a warning.
-    """
-    import_optional(path, "gdstk")
-    wanted, filters, have_colours = _selection(layer, layers, channels, filter_names)
-    with as_file_error(path, "GDSII or OASIS layout"):
-        data = path.read_bytes()
-        is_oasis = data.startswith(OASIS_MAGIC)
-        (_check_oasis if is_oasis else _check_records)(path, data)
-        n_bytes = len(data)
-        del data
-        answer, shapes, covers, lines = _read_in_sandbox(path, is_oasis, wanted, list(filters), cell, n_bytes)
-        counts, tags = shapes.counts, shapes.tags
-        check_site_count(path, counts.size)
-        xy_um = to_um(shapes.xy, answer["dbu_um"])
-        pieces, piece, first = _group_by_site(path, xy_um, counts, tags)
-        columns = _columns(lines, tags[piece], first)
-        columns = _with_channel(columns, tags[piece[first], 1:3], wanted)
-        about = {
-            "made_by": "read_layout",
-            "file": path.name,
-            "format": "OASIS" if is_oasis else "GDSII",
-            "cell": answer["cell"],
-            "dbu_um": float(f"{answer['dbu_um']:.12g}"),
-        }
-        check_sizes(np.ones(counts.size), counts)
-        is_undivided = first.size == piece.size
-        kept = np.arange(first.size)
-        try:
-            layout = layout_from_untrusted(
-                pieces.rings_um if is_undivided else _merge_parts(pieces, first), columns, about
-            )
-        except GeometryError:
-            polygons, kept = _valid_polygons(path, without_keyholes(_merge_parts(pieces, first)), invalid)
-            layout = layout_from_untrusted(polygons, {name: c[kept] for name, c in columns.items()}, about)
-        if filters:
-            site_of = np.full(first.size, -1)
-            site_of[kept] = np.arange(kept.size)
-            site = site_of[np.repeat(np.arange(first.size), np.diff(np.append(first, piece.size)))]
-            number = tags[piece, 8]
-            is_filter = (number >= 0) & (site >= 0)
-            equal = np.stack((site[is_filter], number[is_filter]))
-            covers_um = to_um(covers.xy, answer["dbu_um"])
-            channel = _covering_channels(path, layout, equal, covers_um, covers, filters)
-            colours = {CHANNEL_LETTERS: "".join(FILTER_NAMES)} if have_colours else {}
-            layout = layout.with_columns(channel=channel).with_provenance(about | colours)
-        return layout
-
-
-def _selection(
-    layer: Any, layers: Any, channels: Any, filter_names: Sequence[str] | None
-) -> tuple[list[LayerNumber] | None, dict[LayerNumber, int], bool]:
-    """
-    Return the layers of the photosites (None: default), and the channels of filters.
-
-    The last value is whether they are named by colours.
-    """
-    wanted = None if layer is None else parse_selection(layer)
-    filters = {} if channels is None else parse_channels(channels, filter_names)
-    drawn: list[DrawnLayer] = []
-    if layers is not None:
-        drawn = parse_layer_map(layers, filter_names)
-        if wanted is None:
-            wanted = [d.number for d in drawn if d.name == PHOTOSITE]
-        filters = {d.number: d.channel for d in drawn if d.channel is not None} | filters
-    return wanted, filters, are_colours(channels, drawn, filter_names)
-
-
-def _with_channel(
-    columns: dict[str, NDArray[Any]], tags: Ints, wanted: list[LayerNumber] | None
-) -> dict[str, NDArray[Any]]:
-    """
-    Return the columns with the channel, if the file contains it.
-
-    A column of this name precedes the datatype. The datatype is a channel where it differs between sites, and in files of other
-    programs also where it is not 0 and only a layer number was selected. ``tags`` are datatype and number of each site.
-    """
-    channel = columns.pop(CHANNEL, None)
-    if channel is not None and channel.dtype.kind in "iu" and channel.size:
-        is_index = int(channel.min()) >= 0 and int(channel.max()) <= MAX_SITES
-        columns |= {CHANNEL: channel} if is_index else {}
-    if CHANNEL in columns:
-        return columns
-    datatype, number = tags.T
-    is_other = bool((number < 0).any()) and (wanted is None or any(kind is None for _, kind in wanted))
-    is_channel = bool((datatype != datatype[:1]).any()) or (is_other and bool(datatype.any()))
-    return {CHANNEL: datatype, **columns} if is_channel else columns
-
-
-def _covering_channels(
-    path: Path, layout: Layout, filters: Ints, xy_um: Floats, covers: _gdstk.Shapes, channels: Mapping[LayerNumber, int]
-) -> Ints:
-    """
-    Return the channel of the filter that covers each site.
-
-    A filter covers a site if it contains a point in the interior of the site. ``filters`` are the sites and the filters that
-    have their outlines, as (2, n) indices; ``covers`` are the other filters.
-    """
-    channel_of = np.array(list(channels.values()))
-    site, channel = filters[0], channel_of[filters[1]]
-    found = np.full(layout.n_sites, -1)
-    found[site] = channel
-    if covers.counts.size:
-        number = np.full(covers.counts.size, -1)
-        for k, (layer, datatype) in enumerate(channels):
-            number[
-                (covers.tags[:, 0] == layer) & ((covers.tags[:, 1] == datatype) if datatype is not None else True)
-            ] = k
-        ring_offsets = np.concatenate(([0], np.cumsum(covers.counts)))
-        shapes = Layout(xy_um, ring_offsets, np.arange(ring_offsets.size)).polygons()
-        covered, cover = _covers(layout.polygons(), shapes)
-        site, channel = np.concatenate((site, covered)), np.concatenate((channel, channel_of[number[cover]]))
-        found[site] = channel
-    bare = np.flatnonzero(found < 0)
-    if bare.size and filters.size:
-        # Sites that overlap the site of a filter.
-        owners = np.unique(filters[0])
-        covered, cover = _covers(layout[bare].polygons(), layout[owners].polygons())
-        found[bare[covered]] = found[owners[cover]]
-        bare = np.flatnonzero(found < 0)
-    if bare.size:
-        x, y = layout.centroid_um[bare[0]]
-        raise FileError(
-            path,
-            f"has {bare.size} of {layout.n_sites} photosites without a filter, first site {bare[0]} at ({x:.6g}, {y:.6g}) µm; "
-            "add the layer of its filter to channels= or layers=",
-        )
-    different = np.flatnonzero(found[site] != channel)
-    if different.size:
-        s = int(site[different].min())
-        x, y = layout.centroid_um[s]
-        raise FileError(
-            path, f"has filters of several channels over site {s} at ({x:.6g}, {y:.6g}) µm; select one layer"
-        )
-    return found
-
-
-def _covers(sites: NDArray[Any], shapes: NDArray[Any]) -> tuple[Ints, Ints]:
-    """Return pairs of a site and a shape that contains a point in the interior of the site."""
-    site, shape = shapely.STRtree(shapes).query(shapely.point_on_surface(sites), predicate="within")
-    return site, shape
-
-
-def _check_records(path: Path, data: bytes) -> None:
-    """Check that the GDSII records have known types and are complete up to ENDLIB."""
-    from foveasim.layout.files import _kernels
-
-    is_known = np.zeros(2**16, bool)
-    for kind, records in RECORDS_OF_TYPE.items():
-        is_known[[record << 8 | kind for record in records]] = True
-    at, record = _kernels.walk_records(np.frombuffer(data, np.uint8), is_known, END_OF_LIBRARY)
-    if record == -1:
-        raise FileError(path, f"is corrupt: no valid GDSII record begins at byte {at}")
-    if record != END_OF_LIBRARY or at > len(data):
-        raise FileError(path, "is truncated: the GDSII record ENDLIB is missing or incomplete")
-    if data[at:].strip(b"\0"):
-        raise FileError(path, f"is corrupt: unexpected data after the end of the GDSII library at byte {at}")
-
-
-def _check_oasis(path: Path, data: bytes) -> None:
-    """Check that the END record exists, and that its CRC-32, if any, matches the file."""
-    end = data[-OASIS_END_BYTES:]
-    if len(data) < len(OASIS_MAGIC) + OASIS_END_BYTES or end[0] != OASIS_END:
-        raise FileError(path, "is truncated or corrupt: it does not end with the END record of OASIS")
-    if end[-5] == CRC32_SCHEME and int.from_bytes(end[-4:], "little") != zlib.crc32(memoryview(data)[:-4]):
-        raise FileError(path, "is corrupt: its CRC-32 does not match its content")
-
-
-def _read_in_sandbox(
-    path: Path,
-    is_oasis: bool,
-    layers: list[LayerNumber] | None,
-    filters: list[LayerNumber],
-    cell: str | None,
-    n_bytes: int,
-) -> tuple[dict[str, Any], _gdstk.Shapes, _gdstk.Shapes, bytes]:
-    """Read the file with gdstk in the sandbox process, which a malformed file may crash."""
-    max_cpu_s = MAX_CPU_S + n_bytes // BYTES_PER_S
-    max_memory_bytes = min(MIN_MEMORY_BYTES + MEMORY_PER_BYTE * n_bytes, MAX_MEMORY_BYTES)
-    args = {
-        "is_oasis": is_oasis,
-        "layers": layers,
-        "filters": filters,
-        "cell": cell,
-        "max_sites": MAX_SITES,
-        "max_memory_bytes": max_memory_bytes,
-        "max_text_bytes": max(MIN_STRING_BYTES, STRING_BYTES_PER_BYTE * n_bytes),
-        "max_cpu_s": WALL_TIME_FACTOR * max_cpu_s,
-    }
-    answer, (xy, counts, tags, lines, *covers) = run_in_sandbox(
-        _gdstk.read,
-        path,
-        args,
-        kind="OASIS" if is_oasis else "GDSII",
-        max_cpu_s=max_cpu_s,
-        max_bytes=min(MIN_READING_BYTES + READING_PER_BYTE * n_bytes, max_memory_bytes),
-        is_standalone=True,
-    )
-    return (
-        answer,
-        _gdstk.Shapes(xy, counts, tags, 1),
-        _gdstk.Shapes(covers[0], covers[1], covers[2], 1),
-        lines.tobytes(),
-    )
-
-
-def _group_by_site(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[Layout, Ints, Ints]:
-    """
-    Sort the polygons of the file by site number, and group the parts of divided sites.
-
-    Returns ``pieces``: one unchecked site per polygon. ``piece`` (n_piece,) int64: positions of the polygons in the file.
-    ``first`` (n_site,) int64: index of the first piece of each site.
-    """
-    if counts.size and counts.min() < 3:
-        raise FileError(path, f"contains a polygon with {counts.min()} vertices, expected at least 3")
-    site, part, n_parts, placement = tags[:, 2:6].T
-    # Sites without a number follow the numbered ones, in the order of the file.
-    number = np.where(site >= 0, site, site.max(initial=-1) + 1)
-    order = np.lexsort((part, number, placement))
-    pieces = Layout(xy_um, np.concatenate(([0], np.cumsum(counts))), np.arange(counts.size + 1))
-    if (np.diff(order) != 1).any():
-        pieces = pieces[order]
-    if not n_parts.any():
-        return pieces, order, np.arange(order.size)
-    key = np.stack((placement, number, n_parts), 1)[order]
-    is_first = np.concatenate(([True], (key[1:] != key[:-1]).any(axis=1))) | (n_parts[order] == 0)
-    first = np.flatnonzero(is_first)
-    size = np.diff(np.append(first, order.size))
-    is_wrong = (n_parts[order] != np.repeat(size, size)) | (part[order] != positions_in_runs(size) + 1)
-    is_wrong &= n_parts[order] > 0
-    if is_wrong.any():
-        bad = order[np.flatnonzero(is_wrong)[0]]
-        raise FileError(path, f"has missing or duplicate parts of photosite {site[bad]}, expected {n_parts[bad]} parts")
-    return pieces, order, first
-
-
-def _merge_parts(pieces: Layout, first: Ints) -> NDArray[Any]:
-    """Merge the pieces of each site into one polygon."""
-    polygons = pieces.polygons()
-    merged = polygons[first]
-    size = np.diff(np.append(first, polygons.size))
-    for i in np.flatnonzero(size > 1):
-        merged[i] = shapely.coverage_union_all(polygons[first[i] : first[i] + size[i]])
-    return merged
-
-
-def _valid_polygons(path: Path, polygons: NDArray[Any], invalid: str) -> tuple[NDArray[Any], Ints]:
-    """
-    Return the valid polygons and their indices, repaired ones included.
-
-    Raises FileError when a polygon is invalid, and ``invalid`` is ``"error"``, or no valid polygon remains. Raises
-    GeometryError when the layout is invalid for other reasons.
-    """
-    check_sizes(np.maximum(shapely.get_num_interior_rings(polygons), 0) + 1, shapely.get_num_coordinates(polygons))
-    polygons = polygons.copy()
-    where: dict[int, str] = {}
-    kept = np.arange(polygons.size)
-    while True:
-        try:
-            Layout.from_polygons(polygons[kept])
-            break
-        except GeometryError as error:
-            bad = kept[list(error.site_ids)]
-            if bad.size == 0:
-                raise
-        is_new = [int(site) not in where for site in bad]
-        where |= {int(site): _place(polygons[site]) for site in bad[is_new]}
-        if invalid == "repair":
-            for site in bad[is_new]:
-                parts = shapely.get_parts(shapely.make_valid(polygons[site]))
-                polygons[site] = parts[np.argmax(shapely.area(parts))] if parts.size else None
-            # Outlines without area vanish, and repaired ones are checked again.
-            bad = bad[[not new or not _is_area(polygons[site]) for new, site in zip(is_new, bad, strict=True)]]
-        kept = np.setdiff1d(kept, bad)
-        if kept.size == 0:
-            break
-    if not where:
-        return polygons, kept
-    shown = ", ".join(f"site {site} at {where[site]} µm" for site in sorted(where)[:MAX_LISTED_OUTLINES])
-    shown += f" and {len(where) - MAX_LISTED_OUTLINES} more" * (len(where) > MAX_LISTED_OUTLINES)
-    what = f"of {polygons.size} outlines cross themselves or have no area"
-    if invalid == "error" or kept.size == 0:
-        fix = "correct them" if kept.size == 0 else "correct them, or pass invalid='skip' or invalid='repair'"
-        raise FileError(path, f"{len(where)} {what}, {shown}; {fix}")
-    n_skipped = polygons.size - kept.size
-    n_repaired = len(where) - n_skipped
-    done = f"{n_skipped} are skipped" + f", {n_repaired} repaired" * (invalid == "repair")
-    warn(f"{path.name}: {len(where)} {what}, {shown}: {done}", LayoutWarning)
-    return polygons[kept], kept
-
-
-def _place(polygon: Any) -> str:
-    """Return the position of the problem of an outline, or its first vertex."""
-    found = re.search(r"\[(\S+) (\S+)\]", str(shapely.is_valid_reason(polygon)))
-    x, y = map(float, found.groups()) if found else shapely.get_coordinates(polygon)[0]
-    return f"({x:.6g}, {y:.6g})"
-
-
-def _is_area(geometry: Any) -> bool:
-    return isinstance(geometry, shapely.Polygon) and geometry.area > 0.0
-
-
-def _columns(lines: bytes, tags: Ints, first: Ints) -> dict[str, NDArray[Any]]:
-    """
-    Return the columns with a value for all pieces, equal for all pieces of a site.
-
-    ``tags`` are those of the pieces, with the line of each piece in ``lines`` and its index in an array.
-    """
-    columns = {}
-    line, row, column = tags[:, 6], tags[:, 7] >> 32, tags[:, 7] & 0xFFFFFFFF
-    size = np.diff(np.append(first, line.size))
-    for name, (values, steps) in parse_columns(lines).items() if lines else ():
-        if values.itemsize * line.size > MAX_COLUMN_BYTES:
-            continue
-        pieces = values[line]
-        if steps is not None:
-            pieces = pieces + steps[line, 0] * column + steps[line, 1] * row
-        of_site = pieces[first]
-        if np.array_equal(np.repeat(of_site, size), pieces, equal_nan=values.dtype.kind == "f"):
-            columns[name] = of_site
-    return columns
 
 
 for _name, _title, _suffixes, _magic in (
@@ -928,7 +557,17 @@ for _name, _title, _suffixes, _magic in (
             signatures=(_magic,),
             read=read,
             write=write,
-            read_options=("layer", "cell", "layers", "channels", "filter_names", "invalid"),
-            write_options=("layer", "layers", "filter_names", "dbu_um", "hierarchy"),
+            read_options=(
+                "layer",
+                "cell",
+                "layers",
+                "channels",
+                "filter_names",
+                "invalid",
+                "duplicates",
+                "missing",
+                "circle_tolerance",
+            ),
+            write_options=("layer", "layers", "filter_names", "dbu_um", "hierarchy", "max_vertices"),
         ),
     )

@@ -27,6 +27,7 @@ from foveasim.errors import FileError
 from foveasim.layout.files._common import (
     FORMATS,
     WrittenLayout,
+    check_readable,
     check_site_count,
     check_table_header,
     layout_from_untrusted,
@@ -52,6 +53,7 @@ MAX_NAMES = 256
 
 def write(layout: Layout, path: Path) -> WrittenLayout:
     """Write a GeoJSON FeatureCollection."""
+    check_readable(layout)
     columns = plain_columns(layout, "GeoJSON")
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(f'{{"type": "FeatureCollection", "foveasim": {json.dumps(table_header(layout))}, "features": [')

@@ -23,6 +23,7 @@ from foveasim.layout.files._common import (
     FORMATS,
     WrittenLayout,
     check_decompressed,
+    check_readable,
     check_site_count,
     check_table_header,
     layout_from_untrusted,
@@ -63,6 +64,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     FileError when pyarrow is not installed, or the file cannot be written.
     """
     pa, parquet = _pyarrow(path)
+    check_readable(layout)
     columns = plain_columns(layout, "GeoParquet")
     if GEOMETRY in columns:
         raise ParameterError(
