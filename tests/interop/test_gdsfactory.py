@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from other_programs import other_program
 
 import foveasim as fs
