@@ -22,10 +22,11 @@ arguments; arguments override the metadata of the file. A corrupt, truncated or 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 from numpy.typing import ArrayLike
 
-from foveasim._core.calls import publish
+from foveasim._core.calls import POSITIVE, publish
 from foveasim._core.registry import import_all
 from foveasim._core.validation import freeze
 from foveasim._io.atomic import atomic_write
@@ -50,6 +51,7 @@ def read_power_map(
     origin_um: tuple[float, float] | None = None,
     top_row_first: bool | None = None,
     name: str | None = None,
+    focal_length_mm: Annotated[float | None, POSITIVE] = None,
 ) -> PowerMap:
     """
     Read a power map from a file.
@@ -75,6 +77,8 @@ def read_power_map(
         false for npy, npz and FITS; given by the coordinate y for netCDF and zarr.
     name : str, optional
         Name of the array, variable or extension, if the file contains several.
+    focal_length_mm : float, optional, mm
+        Focal length that converts cells in angles, as in FITS files of telescopes, to lengths.
 
     Returns
     -------
@@ -109,6 +113,7 @@ def read_power_map(
         unit=unit,
         origin_um=origin_um,
         top_row_first=top_row_first,
+        focal_length_mm=focal_length_mm,
     )
     with as_file_error(path, "power map", passes=(ParameterError,)):
         kind, _ = detect_format(path, MAP_FORMATS, "power map")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from foveasim._core.validation import (
     Floats,
     Images,
     band_widths_nm,
+    check_number,
     check_pitch_um,
     finite_array,
     read_only,
@@ -44,6 +46,8 @@ class Found:
         Whether the first row is the top row, and the first column the rightmost column.
     pitch_um : (along x, along y), µm
     origin_um : (x0, y0), µm
+    pitch_deg, origin_deg : (along x, along y), degrees
+        Pitch and origin of a file in angles, instead of lengths.
     wavelength_nm, band_width_nm : (n_band,), nm
     unit : str
         Unit as written in the file: ``w_m2``, ``W m-2 nm-1``, ``uW/cm^2``, ...
@@ -54,6 +58,8 @@ class Found:
     is_x_descending: bool = False
     pitch_um: tuple[float, float] | None = None
     origin_um: tuple[float, float] | None = None
+    pitch_deg: tuple[float, float] | None = None
+    origin_deg: tuple[float, float] | None = None
     wavelength_nm: Sequence[float] | None = None
     band_width_nm: Sequence[float] | None = None
     unit: str | None = None
@@ -71,6 +77,7 @@ class Given:
     unit: Unit | None = None
     origin_um: tuple[float, float] | None = None
     top_row_first: bool | None = None
+    focal_length_mm: float | None = None
 
     def __post_init__(self) -> None:
         if self.pitch_um is not None:
@@ -81,6 +88,8 @@ class Given:
             finite_array("band_width_nm", self.band_width_nm, above=0.0)
         if self.origin_um is not None:
             Grid((1, 1), 1.0, self.origin_um)
+        if self.focal_length_mm is not None:
+            check_number("focal_length_mm", self.focal_length_mm, above=0.0)
 
 
 def to_power_map(found: Found, given: Given) -> PowerMap:
@@ -91,6 +100,7 @@ def to_power_map(found: Found, given: Given) -> PowerMap:
     inconsistent with the data.
     """
     images = as_images(found.data)
+    found = _in_lengths(found, given)
     pitch_um = _pitch_um(found, given)
     waves_nm = _wavelengths_nm(images, found, given)
     data = _in_w_m2(images, waves_nm, found, given)
@@ -105,6 +115,26 @@ def to_power_map(found: Found, given: Given) -> PowerMap:
         wavelength_nm=waves_nm,
         origin_um=origin_um,
     )
+
+
+def _in_lengths(found: Found, given: Given) -> Found:
+    """Return a map in lengths; angles are multiplied by the focal length, the scale of a lens on its axis."""
+    focal_mm = given.focal_length_mm
+    if found.pitch_deg is None:
+        if focal_mm is not None:
+            raise ParameterError("focal_length_mm", "must be omitted for a map without cells in angles", focal_mm)
+        return found
+    if focal_mm is None:
+        if given.pitch_um is not None:
+            return found
+        raise FormatError(
+            f"has cells of {found.pitch_deg[0] * 3600.0:.6g} arcsec, an angle; pass focal_length_mm=..., or pitch_um=..."
+        )
+    per_deg = math.radians(1.0) * 1e3 * focal_mm
+    pitch_um, origin_um = (
+        None if at is None else (at[0] * per_deg, at[1] * per_deg) for at in (found.pitch_deg, found.origin_deg)
+    )
+    return replace(found, pitch_um=pitch_um, origin_um=origin_um)
 
 
 def _pitch_um(found: Found, given: Given) -> Pitch:

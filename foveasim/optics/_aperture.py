@@ -123,6 +123,9 @@ class PSFModel(Protocol):
     def strehl(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
         """Return the PSF at the image point relative to that without aberrations."""
 
+    def ideal_peak_per_um2(self, wavelength_nm: float, lambda_n_um: float, field_um: tuple[float, float]) -> float:
+        """Return the PSF at the image point without aberrations, 1/µm²."""
+
     def otf(
         self, wavelength_nm: float, s_x: Floats, s_y: Floats, field_um: tuple[float, float]
     ) -> NDArray[np.complex128] | None:
@@ -517,6 +520,15 @@ class Aperture:
             amplitude, _, _ = self.samples(wavelength_nm, n_across, field_um)
             total, size = amplitude.sum(), np.abs(amplitude).sum()
         return min(1.0, float(np.abs(total / size) ** 2))  # 1 exceeded by rounding
+
+    def ideal_peak_per_um2(self, wavelength_nm: float, lambda_n_um: float, field_um: tuple[float, float]) -> float:
+        """Return the PSF at the image point of the same aperture without phase, 1/µm²."""
+        radians, integrals = self._resolve(wavelength_nm, field_um)
+        if radians is None:
+            n_across = max(self.n_across(wavelength_nm, field_um), PUPIL_POINTS)
+            amplitude, _, power = self.samples(wavelength_nm, n_across, field_um)
+            return float(np.abs(amplitude).sum() ** 2 / power / (n_across * lambda_n_um) ** 2)
+        return float(np.abs(integrals[-2]) ** 2 / integrals[-1].real / (2.0 * lambda_n_um) ** 2)
 
     def otf(
         self, wavelength_nm: float, s_x: Floats, s_y: Floats, field_um: tuple[float, float]

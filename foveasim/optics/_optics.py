@@ -937,7 +937,7 @@ class Optics(PointImages):
         """Return the period of the cut-off frequency: λN, or two samples of coarser PSFs."""
         waves_nm = finite_array("wavelength_nm", wavelength_nm, above=0.0)
         lambda_n_um = np.asarray(um_from_nm(waves_nm) * self.working_f_number(distance_m))
-        return lambda_n_um if self.psfs is None else np.asarray(self.psfs.cut_off_um(lambda_n_um))
+        return lambda_n_um if self.psfs is None else np.asarray(self.psfs.cut_off_um(waves_nm, lambda_n_um))
 
     def _field_points_um(self, grid: Grid) -> list[tuple[float, float]]:
         """Return the field points with the strongest aberrations."""

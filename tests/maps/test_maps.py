@@ -408,7 +408,8 @@ def test_fits_extension_is_selected_by_name(tmp_path):
     fits.HDUList([fits.PrimaryHDU(), *images]).writeto(tmp_path / "map.fits")
     metadata = {"wavelength_nm": 550.0, "unit": "w_m2"}
 
-    assert read_power_map(tmp_path / "map.fits", **metadata).data.max() == 1.0
+    assert_rejected(tmp_path / "map.fits", "contains 2 images: N1, N2; select the map with name=", **metadata)
+    assert read_power_map(tmp_path / "map.fits", **metadata, name="N1").data.max() == 1.0
     assert read_power_map(tmp_path / "map.fits", **metadata, name="N2").data.max() == 2.0
     assert read_power_map(tmp_path / "map.fits", **metadata, name="2").grid.pitch_um == 3.5
     assert_rejected(tmp_path / "map.fits", r"contains no image 'N3'", **metadata, name="N3")
@@ -422,7 +423,10 @@ def test_fits_in_degrees_requires_pitch(tmp_path):
     )
 
     assert_rejected(
-        tmp_path / "map.fits", "does not specify the cell size; pass pitch_um=", wavelength_nm=550.0, unit="w_m2"
+        tmp_path / "map.fits",
+        r"has cells of 360 arcsec, an angle; pass focal_length_mm=\.\.\., or pitch_um=",
+        wavelength_nm=550.0,
+        unit="w_m2",
     )
 
 

@@ -122,7 +122,8 @@ def write_as(path, psf, x_um, y_um):
             f"psfs:\n  - {{file: point.txt, x_um: {-x_um}, y_um: {-y_um}, wavelength_nm: 550.0}}\n", encoding="utf-8"
         )
     else:
-        PSFGrid.from_arrays(psf, x_um=x_um, y_um=y_um, wavelength_nm=WAVE_NM, pitch_um=STEP_UM).write(path)
+        about = {"x_um": x_um, "y_um": y_um, "wavelength_nm": WAVE_NM, "pitch_um": STEP_UM}
+        PSFGrid.from_arrays(psf, centre="fft", **about).write(path)
     return read_psfs(path)
 
 
@@ -148,7 +149,7 @@ def test_wrong_centre_displaces_light():
     psf = LENS.psf(WAVE_NM, distance_m=1.0, pitch_um=STEP_UM, n_points=n + 1).psf_per_um2[:n, :n]
     about = {"x_um": 0.0, "y_um": 0.0, "wavelength_nm": WAVE_NM, "pitch_um": STEP_UM}
     scene = point((61, 61), 30, 30, pitch_um=122.0)
-    right = with_psfs(PSFGrid.from_arrays(psf, **about)).power_map(scene).data
+    right = with_psfs(PSFGrid.from_arrays(psf, centre="fft", **about)).power_map(scene).data
     wrong = with_psfs(PSFGrid.from_arrays(psf, centre=(31, 32), **about)).power_map(scene).data
 
     assert displaced(right, LENS.power_map(scene).data) < 0.03
@@ -549,6 +550,11 @@ GOOD = {"psf": np.pad(np.ones((3, 1, 3, 3)), ((0, 0), (0, 0), (3, 3), (3, 3))), 
         ({"relative_illumination": [1.0, 0.9]}, r"must have the shape \(n_point, n_wavelength\) = \(3, 1\), got \(2,"),
         ({"relative_illumination": [1.0, 0.9, -0.1]}, r"'relative_illumination' must be >= 0"),
         ({"centre": (9, 0)}, r"'centre' must be within the 9 x 9 samples"),
+        ({"centre": "left"}, "'centre' must be two numbers"),
+        ({"psf": np.ones((3, 8, 9))}, "'centre' must be given for even numbers of samples, got 8 x 9; pass 'fft'"),
+        ({"pitch_um": None}, "'pitch_um' must be given, or 'sample_x_um' and 'sample_y_um'"),
+        ({"pitch_um": [1.0, 2.0]}, "'pitch_um' must have one value, or one per wavelength, 1, got 2"),
+        ({"sample_x_um": np.arange(9.0)}, "'pitch_um' must be omitted with 'sample_x_um'"),
         ({"image": "mirrored"}, r"'image' must be one of 'upright', 'inverted', got 'mirrored'"),
     ],
 )
@@ -613,9 +619,9 @@ def npz_with(path, **changes):
     [
         ({"pitch_um": None}, "has no 'pitch_um', which files of PSFs must contain"),
         ({"extra": [1.0]}, "has the unknown array 'extra'; expected psf, x_um"),
-        ({"pitch_um": [1.0, 2.0]}, "must have one 'pitch_um', got 2"),
+        ({"pitch_um": [1.0, 2.0]}, "'pitch_um' must have one value, or one per wavelength, 1, got 2"),
         ({"image": "inverse"}, "must have 'upright' or 'inverted' as 'image', got 'inverse'; did you mean 'inverted'"),
-        ({"centre": [0.5, 1.0]}, r"must have two integers \(row, column\) as 'centre'"),
+        ({"centre": [0.5, 1.0, 2.0]}, r"must have two numbers \(row, column\), 'fft' or 'middle' as 'centre'"),
         ({"y_um": [0.0, 1.0, 1.0]}, "must be different for all points"),
         ({"psf": np.full((3, 1, 9, 9), np.inf)}, "'psf' must be finite"),
         ({"psf": np.array([None, 1.0], object)}, "an array of Python objects"),
@@ -817,7 +823,28 @@ def test_wrong_text_of_an_index_is_rejected(tmp_path, text, message):
     [
         ("Listing of FFT", "Listing of MTF", "is not a valid file of PSFs"),
         ("Values are", "Numbers are", "has no line 'Values are ...', after which the values begin"),
-        ("Data spacing is", "Spacing:", "has no 'Data spacing is' in its header"),
+        ("Data spacing is", "Spacing:", "has the unknown line 'Spacing: 0.250000000 µm.' in its header"),
+        ("Data spacing is 0.250000000 µm.", "", "has no 'Data spacing is' in its header"),
+        (
+            "Surface: Image",
+            "Rotation: 90",
+            "has the unknown line 'Rotation: 90' in its header, which may change the PSF",
+        ),
+        ("Surface: Image", "Center: centroid", "has the unknown line 'Center: centroid' in its header"),
+        (
+            "Surface: Image",
+            "Data spacing is 0.5 µm.",
+            "has two lines about the same, 'Data spacing is 0.250000000 µm.'",
+        ),
+        (
+            "Values are not normalized",
+            "Values are the logarithm",
+            "has values that are no irradiance, 'Values are the log",
+        ),
+        ("Center point is: row 5, column 4", "", "has no line 'Center point is' in its header; pass centre="),
+        ("row 5, column 4", "row 5, column 9", "has the centre 'Center point is: row 5, column 9' outside its 8 by 8"),
+        ("row 5, column 4", "(5, 4)", r"has the unknown line 'Center point is: \(5, 4\)' in its header"),
+        ("0.250000000 µm", "1,250.0 µm", "has the number '1,250.0' in its header, expected one decimal point or comma"),
         ("0.5500 to 0.5500", "0.4500 to 0.6500", "is the PSF of 0.45 to 0.65 µm; export one wavelength per file"),
         ("0.250000000 µm", "0.250000000 in", "has the unit of length 'in', expected µm"),
         ("Image grid size: 8 by 8", "Image grid size: 8 by 9", "has 64 values, expected 8 by 9 = 72"),

@@ -43,13 +43,13 @@ class FieldPSFs:
     @classmethod
     def at(cls, psfs: PSFGrid, f_number: float) -> FieldPSFs:
         """Create the PSFs, with a warning if samples are coarser than λN/2."""
-        shortest_nm = float(psfs.wavelength_nm[0])
-        needed_um = 0.5 * float(um_from_nm(shortest_nm)) * f_number
-        if psfs.pitch_um > (1.0 + ROUNDING) * needed_um:
+        needed_um = 0.5 * um_from_nm(psfs.wavelength_nm) * f_number
+        worst = int(np.argmax(psfs.pitches_um / needed_um))
+        if psfs.pitches_um[worst] > (1.0 + ROUNDING) * needed_um[worst]:
             warn(
-                f"the PSFs have samples of {psfs.pitch_um:.4g} µm, coarser than λN/2 = {needed_um:.4g} µm at "
-                f"{shortest_nm:g} nm and f/{f_number:.4g}: fine detail is lost or displaced; export finer samples, or "
-                "check f_number",
+                f"the PSFs have samples of {psfs.pitches_um[worst]:.4g} µm, coarser than λN/2 = {needed_um[worst]:.4g} µm at "
+                f"{psfs.wavelength_nm[worst]:g} nm and f/{f_number:.4g}: fine detail is lost or displaced; export finer "
+                "samples, or check f_number",
                 SamplingWarning,
             )
         return cls(psfs, f_number)
@@ -66,7 +66,7 @@ class FieldPSFs:
 
     def unit_um(self, wavelength_nm: Any) -> Any:
         """Return λN, or two samples if these are coarser."""
-        return self.psfs.cut_off_um(um_from_nm(wavelength_nm) * self.f_number)
+        return self.psfs.cut_off_um(wavelength_nm, um_from_nm(wavelength_nm) * self.f_number)
 
     def transmittance(self, wavelength_nm: float) -> float:  # noqa: ARG002
         """Return the transmitted power; that of the lens follows from its f-number."""
@@ -84,9 +84,12 @@ class FieldPSFs:
     @cached_property
     def _blur_um(self) -> float:
         """Largest radius around the image point of :data:`BLUR_FRACTION` of the light."""
-        psf, pitch_um = self.psfs.psf, self.psfs.pitch_um
+        psf, pitches_um = self.psfs.psf, self.psfs.pitches_um
+        # Varying PSFs are centred on their centroids.
+        offset_x, offset_y = (0.0, 0.0) if self.psfs.is_varying else self.psfs.middle_offset
         n_y, n_x = psf.shape[2:]
-        radius = np.hypot((np.arange(n_y) - n_y // 2)[:, np.newaxis], np.arange(n_x) - n_x // 2).ravel()
+        row, column = np.arange(n_y) - n_y // 2 + offset_y, np.arange(n_x) - n_x // 2 + offset_x
+        radius = np.hypot(row[:, np.newaxis], column).ravel()
         order = np.argsort(radius)
         displaced_um = np.hypot(*np.moveaxis(self.psfs.centroid_um, -1, 0)) * self.psfs.is_varying
         largest_um = 0.0
@@ -94,7 +97,7 @@ class FieldPSFs:
             for w in range(psf.shape[1]):
                 enclosed = np.cumsum(self._central[p, w].ravel()[order], dtype=np.float64)
                 within = float(radius[order][min(int(np.searchsorted(enclosed, BLUR_FRACTION)), radius.size - 1)])
-                largest_um = max(largest_um, within * pitch_um + float(displaced_um[p, w]))
+                largest_um = max(largest_um, within * float(pitches_um[w]) + float(displaced_um[p, w]))
         return largest_um
 
     def n_across(self, wavelength_nm: float, field_um: tuple[float, float]) -> int:
@@ -119,7 +122,8 @@ class FieldPSFs:
         if not self.psfs.is_varying:
             return psf
         n_y, n_x = psf.shape[2:]
-        shift = self.psfs.centroid_um / self.psfs.pitch_um
+        # From the middle sample to the centroid, in samples.
+        shift = self.psfs.centroid_um / self.psfs.pitches_um[:, np.newaxis] - self.psfs.middle_offset
         phase_x, phase_y = (
             np.exp(2j * np.pi * shift[..., axis, np.newaxis] * np.fft.fftfreq(n)) for axis, n in ((0, n_x), (1, n_y))
         )
@@ -191,21 +195,33 @@ class FieldPSFs:
         mean = float(weights @ fraction.mean(axis=1))
         return max(0.0, float(weights @ fraction @ self._of_wavelength(wavelength_nm)) / mean) if mean > 0.0 else 1.0
 
-    def _sample(self, wavelength_nm: float, field_um: tuple[float, float]) -> tuple[NDArray[Any], Floats]:
-        """Return the PSF without displacement, (n_y, n_x), and its displacement."""
+    def _sample(
+        self, wavelength_nm: float, field_um: tuple[float, float]
+    ) -> list[tuple[NDArray[Any], float, tuple[float, float]]]:
+        """
+        Return the terms of a PSF, one for each pitch.
+
+        Each has values (n_y, n_x), the pitch, and the position (x, y) of the middle sample relative to the image point, µm.
+        """
         (weights,), (angle_rad,) = self._weights(np.array([field_um], np.float64))
-        waves = self._of_wavelength(wavelength_nm)
+        waves, pitches_um = self._of_wavelength(wavelength_nm), self.psfs.pitches_um
         source = self._splines if angle_rad else self._central
-        psf = np.zeros(source.shape[2:], source.dtype)
-        for w in np.flatnonzero(waves):
-            psf += np.einsum("p,pyx->yx", (waves[w] * weights).astype(source.dtype), source[:, w])
-        if angle_rad:
-            psf = self._turn(psf, float(angle_rad))
-        if not self.psfs.is_varying:  # the samples contain the displacement
-            return psf, np.zeros(2)
         x_um, y_um = np.einsum("p,pwi,w->i", weights, self.psfs.centroid_um, waves)
         cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-        return psf, np.array([cos * x_um - sin * y_um, sin * x_um + cos * y_um])
+        centroid_um = cos * x_um - sin * y_um, sin * x_um + cos * y_um
+        found = []
+        for pitch_um in dict.fromkeys(pitches_um[waves > 0.0].tolist()):
+            psf = np.zeros(source.shape[2:], source.dtype)
+            has_pitch = (waves > 0.0) & (pitches_um == pitch_um)
+            for w in np.flatnonzero(has_pitch):
+                psf += np.einsum("p,pyx->yx", (waves[w] * weights).astype(source.dtype), source[:, w])
+            if angle_rad:
+                psf = self._turn(psf, float(angle_rad)) * float(waves[has_pitch].sum())
+            # The samples of one PSF for the whole field contain their displacement.
+            offset_x, offset_y = self.psfs.middle_offset
+            middle_um = centroid_um if self.psfs.is_varying else (offset_x * pitch_um, offset_y * pitch_um)
+            found.append((psf, pitch_um, middle_um))
+        return found
 
     def _turn(self, coefficients: NDArray[Any], angle_rad: float) -> NDArray[Any]:
         """Return samples of a spline, turned counter-clockwise around the centre."""
@@ -242,17 +258,19 @@ class FieldPSFs:
 
         Returns (2 n_lags + 1, 2 n_lags + 1) complex64 or complex128, rows along y: 0 from the cut-off frequency ``1 / u``.
         """
-        psf, displacement_um = self._sample(wavelength_nm, field_um)
-        step = self.psfs.pitch_um / (n_across * float(self.unit_um(wavelength_nm)))
         lags = np.arange(-n_lags, n_lags + 1)
-        # The OTF of a real PSF at -f is the complex conjugate: rows k >= 0 suffice. Chirp z-transforms instead of matrix
-        # products, since the threads of BLAS would compete with ours.
-        upper = _fourier(_fourier(psf, lags * step, 1), lags[n_lags:] * step, 0)
-        for axis, (k, displaced_um) in enumerate(zip((lags[n_lags:], lags), displacement_um[::-1], strict=True)):
-            factor = np.exp(-2j * np.pi * (displaced_um / self.psfs.pitch_um) * step * k)
-            if self.psfs.samples == "bins":
-                factor /= np.sinc(k * step)
-            upper *= np.expand_dims(factor, 1 - axis)
+        upper = np.zeros((n_lags + 1, lags.size), np.complex128)
+        for psf, pitch_um, middle_um in self._sample(wavelength_nm, field_um):
+            step = pitch_um / (n_across * float(self.unit_um(wavelength_nm)))
+            # The OTF of a real PSF at -f is the complex conjugate: rows k >= 0 suffice. Chirp z-transforms instead of matrix
+            # products, since the threads of BLAS would compete with ours.
+            term = _fourier(_fourier(psf, lags * step, 1), lags[n_lags:] * step, 0)
+            for axis, (k, at_um) in enumerate(zip((lags[n_lags:], lags), middle_um[::-1], strict=True)):
+                factor = np.exp(-2j * np.pi * (at_um / pitch_um) * step * k)
+                if self.psfs.samples == "bins":
+                    factor /= np.sinc(k * step)
+                term *= np.expand_dims(factor, 1 - axis)
+            upper += term
         upper[np.hypot(lags[n_lags:, np.newaxis], lags) >= n_across] = 0.0
         upper = np.ascontiguousarray(upper, np.result_type(real, np.complex64))
         return np.concatenate((np.conj(upper[:0:-1, ::-1]), upper))
@@ -262,7 +280,7 @@ class FieldPSFs:
     ) -> NDArray[np.floating[Any]]:
         """Sample the PSF at multiples of u/2, up to ``radius`` of them along each axis."""
         # Fewer frequencies than for interpolation suffice, so that copies of the PSF, 2 n multiples apart, do not overlap it.
-        half = self._turned_side * self.psfs.pitch_um / float(self.unit_um(wavelength_nm))
+        half = self._turned_side * float(self.psfs.pitches_um.max()) / float(self.unit_um(wavelength_nm))
         n = min(n_across, math.ceil(0.5 * (radius + half)) + 1)
         otf = self.compute_otf(wavelength_nm, n, n, field_um, np.float64)
         at = np.arange(-radius, radius + 1) * (-0.5 / n)
@@ -281,25 +299,35 @@ class FieldPSFs:
 
     def strehl(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
         """Return the PSF at the image point relative to that of a clear circle of the f-number."""
-        lambda_n_um = float(um_from_nm(wavelength_nm)) * self.f_number
-        at = np.zeros(1)
-        peak = self.psf_per_um2(wavelength_nm, float(self.unit_um(wavelength_nm)), at, at, field_um)
-        return float(peak[0, 0]) / (0.25 * math.pi / lambda_n_um**2)
+        at, unit_um = np.zeros(1), float(self.unit_um(wavelength_nm))
+        peak = self.psf_per_um2(wavelength_nm, unit_um, at, at, field_um)
+        return float(peak[0, 0]) / self.ideal_peak_per_um2(wavelength_nm, unit_um, field_um)
+
+    def ideal_peak_per_um2(
+        self,
+        wavelength_nm: float,
+        lambda_n_um: float,  # noqa: ARG002
+        field_um: tuple[float, float],  # noqa: ARG002
+    ) -> float:
+        """Return the peak of a clear circle of the f-number, 1/µm²."""
+        return 0.25 * math.pi / (float(um_from_nm(wavelength_nm)) * self.f_number) ** 2
 
     def otf(
         self, wavelength_nm: float, s_x: Floats, s_y: Floats, field_um: tuple[float, float]
     ) -> NDArray[np.complex128]:
         """Return the OTF at frequencies in units of ``1 / u``."""
-        psf, displacement_um = self._sample(wavelength_nm, field_um)
         x, y = np.broadcast_arrays(np.asarray(s_x, np.float64), np.asarray(s_y, np.float64))
-        pitch_um, unit_um = self.psfs.pitch_um, float(self.unit_um(wavelength_nm))
-        along_y, along_x = (
-            np.exp(-2j * np.pi / unit_um * np.outer(s.ravel(), (np.arange(n) - n // 2) * pitch_um + displaced_um))
-            for s, n, displaced_um in zip((y, x), psf.shape, displacement_um[::-1], strict=True)
-        )
-        found = np.einsum("fy,yx,fx->f", along_y, psf, along_x, optimize=True)
-        if self.psfs.samples == "bins":
-            found /= (np.sinc(x * pitch_um / unit_um) * np.sinc(y * pitch_um / unit_um)).ravel()
+        unit_um = float(self.unit_um(wavelength_nm))
+        found = np.zeros(x.size, np.complex128)
+        for psf, pitch_um, middle_um in self._sample(wavelength_nm, field_um):
+            along_y, along_x = (
+                np.exp(-2j * np.pi / unit_um * np.outer(s.ravel(), (np.arange(n) - n // 2) * pitch_um + at_um))
+                for s, n, at_um in zip((y, x), psf.shape, middle_um[::-1], strict=True)
+            )
+            term = np.einsum("fy,yx,fx->f", along_y, psf, along_x, optimize=True)
+            if self.psfs.samples == "bins":
+                term /= (np.sinc(x * pitch_um / unit_um) * np.sinc(y * pitch_um / unit_um)).ravel()
+            found += term
         return np.where(np.hypot(x, y) < 1.0, found.reshape(x.shape), 0.0)
 
 

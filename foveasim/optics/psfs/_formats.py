@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
-from foveasim._core.calls import publish
+from foveasim._core.calls import POSITIVE, publish
 from foveasim._core.names import did_you_mean
 from foveasim._core.registry import Registry
+from foveasim._core.validation import check_number
 from foveasim._io.atomic import atomic_write
-from foveasim._io.formats import FileFormat, FormatError, as_file_error, detect_format, select_writer
+from foveasim._io.formats import FileFormat, FormatError, as_file_error, detect_format, select_writer, validate_options
 from foveasim.errors import FileError
 from foveasim.optics.psfs._grid import PSFGrid
 
@@ -29,15 +31,31 @@ CHOICES: dict[str, tuple[str, ...]] = {
 }
 
 
-def read_psfs(path: str | Path, *, allow_outside: bool = False) -> PSFGrid:
+def read_psfs(
+    path: str | Path,
+    *,
+    name: str | None = None,
+    wavelength_nm: float | Sequence[float] | None = None,
+    focal_length_mm: Annotated[float | None, POSITIVE] = None,
+    centre: tuple[float, float] | Literal["fft", "middle"] | None = None,
+    allow_outside: bool = False,
+) -> PSFGrid:
     """
     Read point spread functions from a file.
 
     Parameters
     ----------
     path : path
-        An ``.npz`` or FITS stack, a text export of Zemax OpticStudio, or a YAML index of such exports: see the guide of the
-        optics.
+        An ``.npz`` or FITS stack, FITS images of POPPY, STPSF and other programs, a text export of Zemax OpticStudio, or a YAML
+        index of such exports: see the guide of the optics.
+    name : str, optional
+        Name or number of the image in a FITS file of several: ``"OVERSAMP"``. By default all, if their wavelengths differ.
+    wavelength_nm : float or sequence, optional, nm
+        Wavelengths of FITS images without them, and the wavelength for which a PSF of a range stands.
+    focal_length_mm : float, optional, mm
+        Focal length that converts samples in angles, as in FITS files of telescopes, to lengths.
+    centre : (row, column) or {"fft", "middle"}, optional
+        As for :meth:`PSFGrid.from_arrays`; by default that of the file. The middle for FITS images without coordinates.
     allow_outside : bool
         Whether an index may name files outside its directory. Settings files never allow it.
 
@@ -48,7 +66,10 @@ def read_psfs(path: str | Path, *, allow_outside: bool = False) -> PSFGrid:
     Raises
     ------
     FileError
-        When a file is missing, outside the directory of its index, too large, of another format, or not consistent.
+        When a file is missing, outside the directory of its index, too large, of another format, or not consistent, or has
+        a keyword or a line that changes the PSF and is not known.
+    ParameterError
+        When an argument is not one of the format of the file.
 
     Examples
     --------
@@ -66,10 +87,14 @@ def read_psfs(path: str | Path, *, allow_outside: bool = False) -> PSFGrid:
     source = Path(path)
     _, form = detect_format(source, PSF_FORMATS, "file of PSFs")
     assert form.read is not None
+    options = {"name": name, "wavelength_nm": wavelength_nm, "focal_length_mm": focal_length_mm, "centre": centre}
+    given = validate_options(options, form.read_options, PSF_FORMATS, "read_options")
+    if focal_length_mm is not None:
+        check_number("focal_length_mm", focal_length_mm, above=0.0)
+    if allow_outside and "allow_outside" in form.read_options:
+        given["allow_outside"] = True
     with as_file_error(source, "file of PSFs", passes=(FileError,)):
-        found = form.read(
-            source, **{"allow_outside": True} if allow_outside and "allow_outside" in form.read_options else {}
-        )
+        found = form.read(source, **given)
         if not isinstance(found, PSFGrid):
             raise FormatError(f"must be read as a PSFGrid, got {type(found).__name__}")
         return found

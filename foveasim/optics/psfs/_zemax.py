@@ -8,11 +8,15 @@ A file contains the PSF of one field point and one wavelength. An index in YAML 
       - {file: axis_550.txt, x_um: 0.0, y_um: 0.0, wavelength_nm: 550.0}
       - {file: edge_550.txt, x_um: 0.0, y_um: 1800.0, wavelength_nm: 550.0, relative_illumination: 0.82}
 
-The first row of a listing is that of the largest y, and the centre is that of its header.
+The first row of a listing is that of the largest y, and the centre is that of its header: ``row 129, column 128``, or in older
+versions ``21, 11``, which is row and column, too, unless only the other order lies in the grid. Numbers may have decimal
+commas. Every line of a header is read, known to be irrelevant, or an error if it is about the centre, the spacing or the
+orientation.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,35 +29,50 @@ from foveasim._io.formats import FileFormat, FormatError, as_file_error, listed_
 from foveasim._io.text_files import read_text
 from foveasim._io.yaml_files import MAX_FILE_BYTES as MAX_INDEX_BYTES
 from foveasim._io.yaml_files import parse_yaml
-from foveasim.errors import FileError
+from foveasim.errors import FileError, ParameterError
 from foveasim.optics.psfs._formats import PSF_FORMATS, choices_of, require
-from foveasim.optics.psfs._grid import MAX_POINTS, MAX_SIDE, MAX_VALUES, PSFGrid
+from foveasim.optics.psfs._grid import CENTRES, MAX_POINTS, MAX_SIDE, MAX_VALUES, PSFGrid
 
 TITLE = re.compile(r"\s*Listing of (FFT|Huygens) PSF Data")
 #: Largest size of a listing: 2048 x 2048 values of 16 characters in UTF-16.
 MAX_BYTES = 2**27
 #: Lengths in µm of the units of listings; "µ" in the encodings of OpticStudio.
 UNITS_UM = {"µm": 1.0, "μm": 1.0, "um": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
-NUMBER = r"([-+]?[\d.]{1,32}(?:[eE][-+]?\d{1,4})?)"
-WAVES = re.compile(rf"{NUMBER}(?:\s+to\s+{NUMBER})?\s*(\S+)\s+at\s")
-SPACING = re.compile(rf"Data spacing is\s+{NUMBER}\s*(\S+)")
-SIZE = re.compile(r"Image grid size:\s*(\d+)\s*by\s*(\d+)")
-CENTRE = re.compile(r"Center point is:\s*row\s*(\d+),\s*column\s*(\d+)")
+NUMBER = r"([-+]?[\d.,]{1,32}(?:[eE][-+]?\d{1,4})?)"
+WAVES = re.compile(rf"{NUMBER}(?:\s+to\s+{NUMBER})?\s*([^\W\d_]{{1,4}}|µm|μm)\s+at\s", re.IGNORECASE)
+SPACING = re.compile(rf"Data spacing is\s+{NUMBER}\s*(\S+?)\.?$")
+SIZE = re.compile(r"Image grid size:\s*(\d{1,9})\s*by\s*(\d{1,9})$")
+CENTRE = re.compile(r"Cent(?:er|re) point is:\s*(?:row\s*(\d{1,9}),\s*column\s*(\d{1,9})|(\d{1,9}),\s*(\d{1,9}))\.?$")
+#: Lines that do not change the PSF: names, where it is in the image, sampling of the pupil, and what follows from others.
+IRRELEVANT = re.compile(
+    r"(File|Title|Date|Configuration|Surface|Field|Wavelengths?|Lens units|Pupil grid size|Strehl ratio|"
+    r"Cent(er|re) coordinates|Reference Coordinates?)\b.{0,3}:|"
+    r"Data area is\s|Configuration \d|((Poly|Mono)chromatic )?(FFT|Huygens) PSF$",
+    re.IGNORECASE,
+)
+#: Words of lines that change the PSF.
+RELEVANT = re.compile(
+    r"cent(er|re)|centroid|spacing|delta|grid|pixel|orient|rotat|mirror|flip|transpos|\brow|\bcolumn|\baxis|\baxes|logarithm|"
+    r"\blog\b|\bdB\b|phase|imaginary|\breal\b|amplitude",
+    re.IGNORECASE,
+)
+#: Values that are not proportional to the irradiance.
+OTHER_VALUES = re.compile(r"logarithm|\blog\b|\bdB\b|phase|imaginary|\breal\b|amplitude|radians|degrees", re.IGNORECASE)
 #: Characters and lines of a header that are searched.
 MAX_LINE, MAX_HEADER_LINES = 200, 100
 #: Relative tolerance of wavelengths and distances of samples, which listings round.
 SAME = 1e-3
 KEYS = ("file", "x_um", "y_um", "wavelength_nm")
-INDEX_KEYS = ("psfs", "image", "first_row", "samples")
+INDEX_KEYS = ("psfs", "image", "first_row", "samples", "centre")
 
 
 class Listing(NamedTuple):
-    """PSF of one point and wavelength, values (n_y, n_x); centre (row, column) or None."""
+    """PSF of one point, values (n_y, n_x), of a range of wavelengths; centre (row, column) or None."""
 
     values: Floats
-    wavelength_nm: float
+    range_nm: tuple[float, float]
     pitch_um: float
-    centre: tuple[int, int] | None
+    centre: tuple[float, float] | None
 
 
 def read_listing(path: Path) -> Listing:
@@ -64,14 +83,14 @@ def read_listing(path: Path) -> Listing:
     header = next((k for k, line in enumerate(lines) if line.lstrip().startswith("Values are")), None)
     if header is None:
         raise FormatError("has no line 'Values are ...', after which the values begin")
-    text = "\n".join(line[:MAX_LINE] for line in lines[: min(header, MAX_HEADER_LINES)])
-    waves, spacing, size = (
-        _find(pattern, text, what)
-        for pattern, what in ((WAVES, "wavelength"), (SPACING, "'Data spacing is'"), (SIZE, "'Image grid size'"))
-    )
-    low, high = float(waves[1]), float(waves[2] or waves[1])
-    if abs(high - low) > SAME * low:
-        raise FormatError(f"is the PSF of {low:g} to {high:g} {waves[3]}; export one wavelength per file")
+    if OTHER_VALUES.search(lines[header]):
+        raise FormatError(f"has values that are no irradiance, {lines[header].strip()!r:.60}; export a linear PSF")
+    found = _header([line[:MAX_LINE].strip() for line in lines[1 : min(header, MAX_HEADER_LINES)]])
+    for what in ("wavelength", "'Data spacing is'", "'Image grid size'"):
+        if what not in found:
+            raise FormatError(f"has no {what} in its header")
+    waves, spacing, size = found["wavelength"], found["'Data spacing is'"], found["'Image grid size'"]
+    low, high = _number(waves[1]), _number(waves[2] or waves[1])
     n_x, n_y = int(size[1]), int(size[2])
     if max(n_x, n_y) > MAX_SIDE:
         raise FormatError(f"has {n_x} by {n_y} values, more than the limit of {MAX_SIDE} along a side")
@@ -79,16 +98,56 @@ def read_listing(path: Path) -> Listing:
     if len(words) != n_x * n_y:
         raise FormatError(f"has {len(words)} values, expected {n_x} by {n_y} = {n_x * n_y}")
     try:
-        values = np.array(words, np.float64).reshape(n_y, n_x)
+        values = np.array([word.replace(",", ".") for word in words], np.float64).reshape(n_y, n_x)
     except ValueError as error:
         raise FormatError(f"has a value that is not a number ({error})") from None
-    centre = CENTRE.search(text)
+    per_nm = 1e3 * _unit_um(waves[3])
     return Listing(
         values,
-        1e3 * low * _unit_um(waves[3]),
-        float(spacing[1]) * _unit_um(spacing[2]),
-        (int(centre[1]) - 1, int(centre[2]) - 1) if centre else None,
+        (low * per_nm, high * per_nm),
+        _number(spacing[1]) * _unit_um(spacing[2]),
+        _centre(found["centre"], n_x, n_y) if "centre" in found else None,
     )
+
+
+def _header(lines: list[str]) -> dict[str, re.Match[str]]:
+    """Return the known lines by name; raise a FormatError that contains a line that is not known."""
+    patterns = {"'Data spacing is'": SPACING, "'Image grid size'": SIZE, "centre": CENTRE, "wavelength": WAVES}
+    found: dict[str, re.Match[str]] = {}
+    for line in lines:
+        if IRRELEVANT.match(line):
+            continue
+        for name, pattern in patterns.items():
+            match = pattern.match(line)
+            if match is not None:
+                if name in found and found[name][0] != match[0]:
+                    raise FormatError(f"has two lines about the same, {found[name][0]!r:.60} and {line!r:.60}")
+                found[name] = match
+                break
+        else:
+            if RELEVANT.search(line):
+                raise FormatError(
+                    f"has the unknown line {line!r:.80} in its header, which may change the PSF; remove it"
+                )
+    return found
+
+
+def _centre(match: re.Match[str], n_x: int, n_y: int) -> tuple[float, float]:
+    """Return the indices (row, column) of the centre."""
+    row, column = (int(match[k] or match[k + 2]) - 1 for k in (1, 2))
+    if match[1] is None and not (row < n_y and column < n_x):
+        row, column = column, row
+    if not (0 <= row < n_y and 0 <= column < n_x):
+        raise FormatError(f"has the centre {match[0]!r:.60} outside its {n_x} by {n_y} values")
+    return float(row), float(column)
+
+
+def _number(text: str) -> float:
+    """Return a number with a decimal point or comma."""
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        raise FormatError(f"has the number {text!r:.40} in its header, expected one decimal point or comma") from None
 
 
 def _text(path: Path) -> str:
@@ -104,13 +163,6 @@ def _text(path: Path) -> str:
         return content.decode("cp1252")
 
 
-def _find(pattern: re.Pattern[str], text: str, what: str) -> re.Match[str]:
-    found = pattern.search(text)
-    if found is None:
-        raise FormatError(f"has no {what} in its header")
-    return found
-
-
 def _unit_um(name: str) -> float:
     unit = name.rstrip(".,:;")
     if unit not in UNITS_UM:
@@ -118,23 +170,53 @@ def _unit_um(name: str) -> float:
     return UNITS_UM[unit]
 
 
-def read_one(path: Path) -> PSFGrid:
+def read_one(path: Path, *, wavelength_nm: Any = None, centre: Any = None) -> PSFGrid:
     """Read one listing, whose PSF is that of the whole field."""
     one = read_listing(path)
+    if wavelength_nm is not None and np.size(wavelength_nm) != 1:
+        raise ParameterError("wavelength_nm", f"must be one number for a listing, got {np.size(wavelength_nm)}")
     return PSFGrid.from_arrays(
         one.values,
         x_um=0.0,
         y_um=0.0,
-        wavelength_nm=one.wavelength_nm,
+        wavelength_nm=_wavelength_nm(one, wavelength_nm, "pass wavelength_nm=..., the one for which it stands"),
         pitch_um=one.pitch_um,
         image="inverted",
         first_row="highest",
-        centre=one.centre,
+        centre=_listed_centre(one, centre),
     )
 
 
+def _wavelength_nm(one: Listing, given: Any, cure: str, source: str = "wavelength_nm=") -> float:
+    """Return the wavelength of a listing; one of a range must be given."""
+    low, high = one.range_nm
+    is_one = abs(high - low) <= SAME * low
+    if given is None:
+        if is_one:
+            return low
+        raise FormatError(
+            f"is the PSF of {1e-3 * low:g} to {1e-3 * high:g} µm; export one wavelength per file, or {cure}"
+        )
+    given_nm = float(np.ravel(given)[0])
+    if not low * (1.0 - SAME) <= given_nm <= high * (1.0 + SAME):
+        of = f"at {low:g} nm" if is_one else f"of {low:g} to {high:g} nm"
+        raise FormatError(f"is the PSF {of}, but {source} {given_nm:g} nm")
+    return given_nm
+
+
+def _listed_centre(one: Listing, given: Any) -> Any:
+    """Return the given centre, or that of the header."""
+    if given is None and one.centre is None:
+        raise FormatError("has no line 'Center point is' in its header; pass centre=..., (row, column) from 0")
+    return one.centre if given is None else given
+
+
 def read_index(path: Path, *, allow_outside: bool = False) -> PSFGrid:
-    """Read an index and its listings, which are in its directory unless ``allow_outside``."""
+    """
+    Read an index and its listings, which are in its directory unless ``allow_outside``.
+
+    The pitch may differ between wavelengths, as that of FFT PSFs.
+    """
     about = parse_yaml(path, read_text(path, "an index of PSFs", MAX_INDEX_BYTES))
     entries = _entries(about)
     points = list(dict.fromkeys((entry["x_um"], entry["y_um"]) for entry in entries))
@@ -159,14 +241,18 @@ def read_index(path: Path, *, allow_outside: bool = False) -> PSFGrid:
         raise FormatError(f"has 'relative_illumination' for some files only; add it to {missing!r:.80}")
     fraction = np.ones((len(points), len(waves_nm)))
     listed = [listed_file(path, entry["file"], allow_outside=allow_outside) for entry in entries]
-    first = _listed(path, entries[0], listed[0], None)
+    centre = _index_centre(about.get("centre"))
+    first = _listed(path, entries[0], listed[0], None, centre)
     n_values = len(entries) * first.values.size
     if n_values > MAX_VALUES:
         raise FormatError(f"lists {n_values} values, more than the limit of {MAX_VALUES}")
     stack = np.empty((len(points), len(waves_nm), *first.values.shape))
+    references: dict[int, tuple[str, Listing]] = {}
     for number, entry in enumerate(entries):
-        one = _listed(path, entry, listed[number], (entries[0]["file"], first)) if number else first
         at = points.index((entry["x_um"], entry["y_um"])), waves_nm.index(entry["wavelength_nm"])
+        reference = references.get(at[1], (entries[0]["file"], first._replace(pitch_um=math.nan)))
+        one = _listed(path, entry, listed[number], reference, centre) if number else first
+        references.setdefault(at[1], (entry["file"], one))
         stack[at], fraction[at] = one.values, entry.get("relative_illumination", 1.0)
     x_um, y_um = np.array(points).T
     conventions = {"image": "inverted", "first_row": "highest", **choices_of(about)}
@@ -175,21 +261,29 @@ def read_index(path: Path, *, allow_outside: bool = False) -> PSFGrid:
         x_um=x_um,
         y_um=y_um,
         wavelength_nm=waves_nm,
-        pitch_um=first.pitch_um,
-        centre=first.centre,
+        pitch_um=[references[w][1].pitch_um for w in range(len(waves_nm))],
+        centre=first.centre if centre is None else centre,
         relative_illumination=fraction if given else None,
         **conventions,
     )
 
 
-def _listed(index: Path, entry: dict[str, Any], file: Path, reference: tuple[str, Listing] | None) -> Listing:
-    """Read the listing of an entry, which must be as the first one."""
+def _index_centre(given: Any) -> Any:
+    """Return the centre in an index: (row, column), "fft", "middle", or None."""
+    is_pair = isinstance(given, list) and len(given) == 2 and all(type(at) in (int, float) for at in given)
+    if not (given is None or is_pair or given in tuple(CENTRES)):
+        raise FormatError(f"must have two numbers (row, column), 'fft' or 'middle' as 'centre', got {given!r:.40}")
+    return given
+
+
+def _listed(
+    index: Path, entry: dict[str, Any], file: Path, reference: tuple[str, Listing] | None, centre: Any
+) -> Listing:
+    """Read the listing of an entry, which must be as the first one, and the first one of its wavelength."""
     with as_file_error(file, "listing of a PSF", passes=(FileError,)):
         one = read_listing(file)
-        if abs(one.wavelength_nm - entry["wavelength_nm"]) > SAME * one.wavelength_nm:
-            raise FormatError(
-                f"is the PSF at {one.wavelength_nm:g} nm, but {index.name} lists it for {entry['wavelength_nm']:g} nm"
-            )
+        _wavelength_nm(one, entry["wavelength_nm"], "", f"{index.name} lists it for")
+        _listed_centre(one, centre)
         if reference is None:
             return one
         name, first = reference
@@ -200,8 +294,8 @@ def _listed(index: Path, entry: dict[str, Any], file: Path, reference: tuple[str
             )
         if abs(one.pitch_um - first.pitch_um) > SAME * first.pitch_um:
             raise FormatError(
-                f"has samples of {one.pitch_um:g} µm, expected {first.pitch_um:g} µm as in {name!r:.80}; set the same "
-                "'image delta', or resample it"
+                f"has samples of {one.pitch_um:g} µm, expected {first.pitch_um:g} µm as in {name!r:.80} of the same "
+                "wavelength; set the same 'image delta', or resample it"
             )
         return one
 
@@ -277,7 +371,13 @@ def _example_index(path: Path) -> PSFGrid:
 
 PSF_FORMATS.register(
     "zemax",
-    FileFormat(title="Zemax listing", suffixes=(".txt",), matches=_is_listing, read=read_one),
+    FileFormat(
+        title="Zemax listing",
+        suffixes=(".txt",),
+        matches=_is_listing,
+        read=read_one,
+        read_options=("wavelength_nm", "centre"),
+    ),
     example=_example,
 )
 PSF_FORMATS.register(
