@@ -73,7 +73,7 @@ def test_psf_and_strehl_match_polar_quadrature(name, term):
 
     got = np.concatenate((narrow.psf_per_um2[tuple(at.T)], wide.psf_per_um2[tuple(at_wide.T)])) * LAMBDA_N_UM**2
     assert got == pytest.approx(psf, abs=1e-6 * narrow.psf_per_um2.max() * LAMBDA_N_UM**2)
-    assert optics.strehl(WAVELENGTH_NM) == pytest.approx(strehl, rel=1e-6)
+    assert optics.strehl(WAVELENGTH_NM, reference="image_point") == pytest.approx(strehl, rel=1e-6)
 
 
 @pytest.mark.slow
@@ -89,7 +89,7 @@ def test_strehl_matches_quadrature_for_36_terms(pupil, first):
     for term in range(first, 37, 3):
         wave = np.exp(1j * np.pi * zernike(*noll_to_nm(term), x, y))
 
-        got = lens(pupil, **{f"z{term}": 0.5}).strehl(WAVELENGTH_NM)
+        got = lens(pupil, **{f"z{term}": 0.5}).strehl(WAVELENGTH_NM, reference="image_point")
 
         assert got == pytest.approx(np.abs(weight @ wave) ** 2 / weight.sum() ** 2, rel=1e-6), term
 
@@ -234,7 +234,7 @@ def test_gaussian_callable_has_closed_form_strehl():
 
     a = width - 2j * np.pi * waves
     expected = np.abs((1.0 - np.exp(-a)) / a) ** 2 / ((1.0 - np.exp(-width)) / width) ** 2
-    assert optics.strehl(WAVELENGTH_NM) == pytest.approx(expected, rel=1e-9)
+    assert optics.strehl(WAVELENGTH_NM, reference="image_point") == pytest.approx(expected, rel=1e-9)
 
 
 def test_discontinuous_callable_is_sampled():
