@@ -459,6 +459,21 @@ def test_paths_are_read_as_written(tmp_path_factory, n, seed):
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "\ufefft_s;x_um;y_um;\r\n0;1,5;2\r\n0,5;-3;4,25\r\n",
+        "y_um\tt_s\tx_um\n2\t0\t1,5\n4,25\t0,5\t-3\n",
+        "t_s,x_um,y_um,\n0,1.5,2,\n0.5,-3,4.25,\n",
+    ],
+)
+def test_paths_of_spreadsheets_are_read(tmp_path, text):
+    (tmp_path / "path.csv").write_text(text, encoding="utf-8", newline="")
+    found = GazePath.read(tmp_path / "path.csv")
+    assert found.t_s.tolist() == [0.0, 0.5]
+    assert found.xy_um.tolist() == [[1.5, 2.0], [-3.0, 4.25]]
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "must have the columns 't_s', 'x_um' and 'y_um' in its first line"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import io
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +11,11 @@ from pathlib import Path
 from foveasim._core.names import missing_path
 from foveasim.errors import FileError
 
-__all__ = ["parse_xml", "read_columns", "read_text"]
+__all__ = ["parse_xml", "read_columns", "read_rows", "read_text"]
+
+#: Numbers with a decimal comma and with a decimal point.
+COMMA_NUMBER = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?")
+POINT_NUMBER = re.compile(r"[-+]?(\d+\.\d*|\.\d+)([eE][-+]?\d+)?")
 
 #: Largest depth of elements in XML; the supported files have a few levels.
 MAX_XML_DEPTH = 50
@@ -38,30 +42,98 @@ def read_text(path: Path, what: str, max_bytes: int) -> str:
         raise FileError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
-def read_columns(path: Path, what: str, names: Sequence[str], max_bytes: int) -> list[tuple[int, list[str]]]:
+def read_rows(
+    path: Path, what: str, max_bytes: int, *, has_numbers: bool = True, has_comments: bool = False
+) -> list[tuple[int, list[str]]]:
     """
-    Read columns of a CSV file by the names in its first line.
+    Read the rows of a table, with the separator and the decimal mark of its program.
+
+    Columns are separated by semicolons, tabs, commas or blanks, whichever the first line contains, in this order. Where they
+    are not separated by commas, numbers may have decimal commas. A separator at the end of all rows is ignored.
+
+    ``what``, ``max_bytes``: as for :func:`read_text`. ``has_numbers``: whether cells with numbers are returned with decimal
+    points. ``has_comments``: whether lines that begin with ``#`` are ignored. Returns the number of each line with content, and
+    its cells. Raises FileError when the file cannot be read, is not a table, or has decimal points and commas.
+    """
+    lines = read_text(path, what, max_bytes).splitlines()
+    if has_comments:
+        lines = ["" if line.lstrip().startswith("#") else line for line in lines]
+    separator = _separator(next((line for line in lines if line.strip()), ""))
+    if separator == " ":
+        rows = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip()]
+    else:
+        reader, rows, number = csv.reader(lines, delimiter=separator, strict=True), [], 1
+        try:
+            for row in reader:
+                rows.append((number, [cell.strip() for cell in row]))
+                number = reader.line_num + 1
+        except csv.Error as error:
+            raise FileError(path, f"line {number} cannot be split into columns: {error}") from None
+    rows = _without_trailing_cells([(number, row) for number, row in rows if any(row)])
+    if has_numbers and separator != ",":
+        rows = _with_decimal_points(path, rows)
+    return rows
+
+
+def _separator(line: str) -> str:
+    """Return the separator of columns in a line."""
+    for mark in ";\t":
+        if mark in line:
+            return mark
+    cells = line.split()
+    has_decimal_commas = len(cells) > 1 and all(COMMA_NUMBER.fullmatch(cell) or cell.isdigit() for cell in cells)
+    return "," if "," in line and not has_decimal_commas else " "
+
+
+def _without_trailing_cells(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    """Return rows without the empty cells that follow from a separator at the end of each line."""
+    if not rows:
+        return rows
+    n_columns = max(len(row) for _, row in rows)
+    ends = [row for _, row in rows if len(row) == n_columns]
+    # The header may lack it.
+    if n_columns < 2 or any(row[-1] for row in ends) or len(ends) < len(rows) - (len(rows[0][1]) < n_columns):
+        return rows
+    return [(number, row[: n_columns - 1]) for number, row in rows]
+
+
+def _with_decimal_points(path: Path, rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    """Return rows whose numbers have decimal points instead of commas."""
+    commas = [number for number, row in rows if any(COMMA_NUMBER.fullmatch(cell) for cell in row)]
+    points = [number for number, row in rows if any(POINT_NUMBER.fullmatch(cell) for cell in row)]
+    if commas and points:
+        raise FileError(
+            path, f"has decimal points, in line {points[0]}, and commas, in line {commas[0]}; use one decimal mark"
+        )
+    if not commas:
+        return rows
+    return [
+        (number, [cell.replace(",", ".") if COMMA_NUMBER.fullmatch(cell) else cell for cell in row])
+        for number, row in rows
+    ]
+
+
+def read_columns(
+    path: Path, what: str, names: Sequence[str], max_bytes: int, *, has_numbers: bool = True
+) -> list[tuple[int, list[str]]]:
+    """
+    Read columns of a table by the names in its first line.
 
     Returns the number of each line with its cells in the order of ``names``; empty lines and other columns are ignored.
-    ``what``, ``max_bytes``: as for :func:`read_text`. Raises FileError when the file cannot be read, or a column or a cell is
-    missing.
+    ``what``, ``max_bytes``, ``has_numbers``: as for :func:`read_rows`. Raises FileError when the file cannot be read, or a
+    column or a cell is missing.
     """
-    try:
-        lines = list(csv.reader(io.StringIO(read_text(path, what, max_bytes), newline=""), strict=True))
-    except csv.Error as error:
-        raise FileError(path, f"is not a valid CSV file ({error})") from None
-    header = [name.strip() for name in lines[0]] if lines else []
+    rows = read_rows(path, what, max_bytes, has_numbers=has_numbers)
+    header = rows[0][1] if rows else []
     if not set(names) <= set(header):
         required = " and ".join((", ".join(map(repr, names[:-1])), repr(names[-1])))
         raise FileError(path, f"must have the columns {required} in its first line, got {header}")
     columns = [header.index(name) for name in names]
     found = []
-    for number, line in enumerate(lines[1:], 2):
-        if not line:
-            continue
-        if len(line) != len(header):
-            raise FileError(path, f"has {len(line)} values in line {number}, expected {len(header)}")
-        found.append((number, [line[column].strip() for column in columns]))
+    for number, row in rows[1:]:
+        if len(row) != len(header):
+            raise FileError(path, f"has {len(row)} values in line {number}, expected {len(header)}")
+        found.append((number, [row[column] for column in columns]))
     return found
 
 

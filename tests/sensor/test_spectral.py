@@ -683,7 +683,8 @@ def test_filter_names_are_column_names(tmp_path):
         ("400,0x1\n500,0.2\n", "line 1, column 2: must be a number"),
         ("400,1_0\n500,0.2\n", "line 1, column 2: must be a number"),
         ("400,__import__('os')\n500,0.2\n", "line 1, column 2: must be a number"),
-        ("400;0,1\n500;0,2\n", "line 1, column 2: must be a number, got '0,1'; use a decimal point"),
+        ("400;0,1\n500;0.2\n", "has decimal points, in line 2, and commas, in line 1; use one decimal mark"),
+        ("400;1.000,1\n500;0,2\n", "line 1, column 2: must be a number, got '1.000,1'"),
         ('400,"0.1\n500,0.2\n', "line 1 cannot be split into columns"),
         ("400,0.1\n500,1.2\n", r"line 2, column '1': 1\.2 must be <= 1; for percentages set value_unit='percent'"),
         ("400,0.1\n500,1e999\n", "line 2, column '1': inf must be <= 1"),
@@ -713,6 +714,33 @@ def test_filter_names_are_column_names(tmp_path):
 def test_malformed_curve_file_is_rejected(tmp_path, read, text, message):
     with pytest.raises(FileError, match=rf"curves\.csv: {message}[^\n]*$"):
         read(write_curves(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufeffWellenlaenge (nm);QE [%];IR [%]\r\n400;10,5;0\r\n500,5;62;1,5\r\n",
+        "wavelength_nm;QE [%];IR [%];\n400;10,5;0;\n500,5;62;1,5;\n",
+        "wavelength_nm;QE [%];IR [%]\n400;10,5;0;\n500,5;62;1,5;\n",
+        "nm\tQE%\tIR%\n400\t10,5\t0\n500,5\t62\t1,5\n",
+        "nm,QE%,IR%,\n400,10.5,0,\n500.5,62,1.5,\n,,,\n",
+        "nm QE% IR%\n400 10,5 0\n500,5 62 1,5\n",
+        "# exported\nnm QE% IR%\n400 10.5 0\n\n500.5 62 1.5\n",
+    ],
+)
+def test_tables_of_spreadsheets_are_read(tmp_path, text):
+    (tmp_path / "curves.csv").write_text(text, encoding="utf-8", newline="")
+    filters = read_filters(tmp_path / "curves.csv")
+    assert filters.names == ("QE", "IR")
+    assert [curve.wavelength_nm for curve in filters.curves] == [(400.0, 500.5)] * 2
+    assert [curve.value for curve in filters.curves] == [(0.105, 0.62), (0.0, 0.015)]
+
+
+def test_blanks_and_decimal_commas_without_header(tmp_path):
+    (tmp_path / "curves.csv").write_text("400 0,1\n500 0,25\n", encoding="utf-8")
+    assert read_curve(tmp_path / "curves.csv").value == (0.1, 0.25)
+    (tmp_path / "curves.csv").write_text("400, 0.1\n500, 0.25\n", encoding="utf-8")
+    assert read_curve(tmp_path / "curves.csv").value == (0.1, 0.25)
 
 
 @pytest.mark.parametrize("read", [read_curve, read_filters])

@@ -45,7 +45,9 @@ def read_labels(path: Path, pictures: Sequence[str]) -> list[int] | list[str]:
     if path.suffix.lower() != ".csv":
         raise FileError(path, "must be a .csv file with the columns 'picture' and 'label', or an array (.npy)")
     found: dict[str, str] = {}
-    for number, (name, label) in read_columns(path, "a table of labels", (PICTURE, LABEL), MAX_LABEL_BYTES):
+    for number, (name, label) in read_columns(
+        path, "a table of labels", (PICTURE, LABEL), MAX_LABEL_BYTES, has_numbers=False
+    ):
         if name in found:
             raise FileError(path, f"lists the picture '{name}' twice, again in line {number}")
         found[name] = label

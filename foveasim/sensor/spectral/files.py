@@ -1,16 +1,16 @@
 """
 Spectral curves from text files with one column of wavelengths and columns of values.
 
-Columns are separated by commas, semicolons, tabs or spaces. Lines that begin with ``#`` and empty lines are ignored. A first
-line that does not begin with a number is a header with column names. Units are never inferred from the values: wavelengths are
-in nm and values from 0 to 1, unless the caller or the header specifies another unit (``wavelength_um``, ``QE [%]``).
+Columns are separated by semicolons, tabs, commas or spaces; numbers have decimal points, or decimal commas where columns are
+not separated by commas, as spreadsheets write them in many languages. Lines that begin with ``#`` and empty lines are ignored.
+A first line that does not begin with a number is a header with column names. Units are never inferred from the values:
+wavelengths are in nm and values from 0 to 1, unless the caller or the header specifies another unit (``wavelength_um``,
+``QE [%]``).
 """
 
 from __future__ import annotations
 
-import csv
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from foveasim._core.names import possible_names
 from foveasim._core.validation import MAX_WAVELENGTH_NM, MIN_WAVELENGTH_NM, Floats
-from foveasim._io.text_files import read_text
+from foveasim._io.text_files import read_rows
 from foveasim.errors import FileError
 from foveasim.sensor.spectral.curves import CURVES
 from foveasim.sensor.spectral.response import FilterSet
@@ -182,7 +182,9 @@ def _position(path: Path, table: _Table, column: str | int) -> int:
 
 
 def _read(path: Path, wavelength_unit: WavelengthUnit | None, value_unit: ValueUnit | None) -> _Table:
-    rows = list(_rows(path, read_text(path, "a table of curves", MAX_FILE_BYTES)))
+    rows = read_rows(path, "a table of curves", MAX_FILE_BYTES, has_comments=True)
+    if len(rows) > MAX_ROWS:
+        raise FileError(path, f"must be a table of curves with at most {MAX_ROWS} lines")
     if not rows:
         raise FileError(path, "contains no table, only comments and empty lines")
     first = rows[0][1][0]
@@ -205,32 +207,12 @@ def _read(path: Path, wavelength_unit: WavelengthUnit | None, value_unit: ValueU
     return _Table(names, waves_nm, _validate_values(path, lines, names, numbers[:, 1:], is_percent))
 
 
-def _rows(path: Path, string: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and cells of each line with content."""
-    numbered = [
-        (k, line)
-        for k, line in enumerate(string.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if len(numbered) > MAX_ROWS:
-        raise FileError(path, f"must be a table of curves with at most {MAX_ROWS} lines")
-    first = numbered[0][1] if numbered else ""
-    separator = next((mark for mark in ";\t," if mark in first), " ")
-    for k, line in numbered:
-        try:
-            cells = line.split() if separator == " " else next(csv.reader([line], delimiter=separator, strict=True))
-        except csv.Error as error:
-            raise FileError(path, f"line {k} cannot be split into columns: {error}") from None
-        yield k, [cell.strip() for cell in cells]
-
-
 def _numbers(path: Path, line: int, cells: list[str], n_columns: int) -> list[float]:
     if len(cells) != n_columns:
         raise FileError(path, f"line {line} must have {n_columns} columns, as in the first row, got {len(cells)}")
     for k, cell in enumerate(cells, start=1):
         if not NUMBER.fullmatch(cell):
-            hint = "; use a decimal point" if re.fullmatch(r"[-+]?\d+,\d+", cell) else ""
-            raise FileError(path, f"line {line}, column {k}: must be a number, got {cell[:40]!r}{hint}")
+            raise FileError(path, f"line {line}, column {k}: must be a number, got {cell[:40]!r}")
     return [float(cell) for cell in cells]
 
 
