@@ -87,12 +87,13 @@ def _separator(line: str) -> str:
 
 def _without_trailing_cells(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
     """Return rows without the empty cells that follow from a separator at the end of each line."""
-    if not rows:
-        return rows
-    n_columns = max(len(row) for _, row in rows)
-    ends = [row for _, row in rows if len(row) == n_columns]
-    # The header may lack it.
-    if n_columns < 2 or any(row[-1] for row in ends) or len(ends) < len(rows) - (len(rows[0][1]) < n_columns):
+    n_columns = max((len(row) for _, row in rows), default=0)
+    has_end = [len(row) == n_columns and row[-1] == "" for _, row in rows]
+    is_shorter = [len(row) == n_columns - 1 for _, row in rows]
+    # Either the first line or all others may lack it.
+    is_header_only = has_end[:1] == [True] and all(is_shorter[1:])
+    is_without_header = is_shorter[:1] == [True] and all(has_end[1:])
+    if n_columns < 2 or len(rows) < 2 or not (all(has_end) or is_header_only or is_without_header):
         return rows
     return [(number, row[: n_columns - 1]) for number, row in rows]
 

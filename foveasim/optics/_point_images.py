@@ -110,7 +110,8 @@ class Point:
     def strehl_at_peak(self) -> float:
         """Return the maximum of the PSF relative to that without aberrations."""
         n = math.ceil(self.aperture.blur_lambda_n(self.wavelength_nm, self.field_um) / PEAK_STEP) + PEAK_MARGIN
-        at_um = np.arange(-min(n, MAX_PEAK_STEPS), min(n, MAX_PEAK_STEPS) + 1) * PEAK_STEP * self.lambda_n_um
+        n = min(n, MAX_PEAK_STEPS)
+        at_um = np.arange(-n, n + 1, dtype=np.float64) * (PEAK_STEP * self.lambda_n_um)
         coarse = self.psf_per_um2(at_um, at_um)
         inner = np.pad(coarse, 1)
         neighbours = [

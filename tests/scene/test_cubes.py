@@ -10,12 +10,14 @@ import os
 import pickle
 import struct
 import sys
+import zlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.constants
 from lazy_modules import LazyModule
+from PIL import Image
 
 import foveasim as fs
 from foveasim._io.rasters.mat import write_mat73
@@ -79,6 +81,8 @@ def write_envi(path, values=VALUES, *, code="f", number=4, interleave="bsq", ord
         "map info": "{UTM, 1, 1, 300000, 4000000, 30, 30, 12, North}",
         **{key.replace("_", " "): value for key, value in entries.items()},
     }
+    for line in lines:
+        header.pop(line.partition(" =")[0], None)
     text = "\n".join(["ENVI", "; a comment = {1}", *(f"{k} = {v}" for k, v in header.items() if v is not None), *lines])
     path.write_text(text + "\n")
     return path
@@ -311,8 +315,49 @@ BAD_ENVI = {
     "bad bands": ({"bbl": "{0, 0, 0}"}, "marks all its bands as bad"),
     "short bbl": ({"bbl": "{0, 1}"}, "'bbl' must have 3 numbers, one per band, got 2"),
     "compressed": ({"file_compression": 1}, "is compressed"),
+    "unknown gain": ({"radiometric_gain": 2}, "has the unknown key 'radiometric gain', which may change the values"),
+    "complex": ({"complex_function": "Power"}, "has the unknown key 'complex function', which may change the values"),
+    "two gains": (
+        {"data_gain_values": "{1, 1, 1}", "Data_Gain_Values": "{2, 2, 2}"},
+        "has two values of 'data gain values', '{1, 1, 1}' and '{2, 2, 2}'",
+    ),
+    "library": (
+        {"file_type": "ENVI Spectral Library"},
+        "has the 'file type' 'ENVI Spectral Library', expected ENVI Stand",
+    ),
     "missing": ({"data_ignore_value": 7}, r"got 7 at \[band, row, column\] = \[0, 1, 2\], 1 such values"),
 }
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.upper().replace("; A", "; a"),
+        lambda text: "\ufeff" + text,
+        lambda text: text.replace("wavelength = {", "wavelength =\n  {\n"),
+        lambda text: text.replace(",\n  ", "  "),
+        lambda text: text.replace("\n", "\r\n").replace(" = ", "="),
+        lambda text: text + "\n  ; wavelength = {1}\ndescription = {\n  gain = 2}\noperator = someone\n",
+    ],
+    ids=["upper case", "byte order mark", "brace on next line", "blanks", "line ends", "comments"],
+)
+def test_envi_headers_of_other_programs_are_read(tmp_path, change):
+    path = write_envi(tmp_path / "cube.hdr", data_gain_values="{1, 2, 0.5}", FWHM="{5, 5, 5}")
+    path.write_text(change(path.read_text()), encoding="utf-8", newline="")
+
+    scene = Scene.from_cube(path, **RADIANCE)
+    assert scene.wavelength_nm.tolist() == WAVES
+    np.testing.assert_allclose(radiance(scene), VALUES * np.array([1.0, 2.0, 0.5])[:, None, None])
+
+
+def test_envi_gains_of_reflectance_are_applied(tmp_path):
+    gains = {"data_reflectance_gain_values": "{0.01, 0.02, 0.01}", "data_reflectance_offset_values": "{0, 0, 0.1}"}
+    lit = {"distance_m": 1.0, "illuminant": "E", "radiance_w_m2_sr_nm": 1.0}
+    expected = VALUES * np.array([0.01, 0.02, 0.01])[:, None, None] + np.array([0.0, 0.0, 0.1])[:, None, None]
+    scene = Scene.from_cube(write_envi(tmp_path / "cube.hdr", **gains), **lit)
+    np.testing.assert_allclose(radiance(scene), expected, rtol=1e-6)
+    both = write_envi(tmp_path / "cube.hdr", data_gain_values="{2, 2, 2}", **gains)
+    np.testing.assert_allclose(radiance(Scene.from_cube(both, **RADIANCE)), 2.0 * VALUES, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("entries", "match"), BAD_ENVI.values(), ids=BAD_ENVI)
@@ -825,8 +870,95 @@ def test_wrong_setting_gives_key_path(tmp_path, change, match, monkeypatch):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("save", [scipy.io.savemat, write_mat73], ids=["v5", "v7.3"])
+def test_matlab_structs_contain_cubes(tmp_path, save):
+    cube = np.moveaxis(VALUES, 0, 2)
+    inner = {"cube": cube, "wavelengths": np.array(WAVES), "unit": PER_NM}
+    path = tmp_path / "cube.mat"
+    save(path, {"data": {"part": inner, "other": np.ones((2, 2))}, "lines": np.arange(3.0), "wave": np.arange(3.0)})
+    for name in ("data.part.cube", "data/part/cube"):
+        scene = Scene.from_cube(path, name=name, distance_m=1.0)
+        np.testing.assert_array_equal(radiance(scene), VALUES)
+        assert scene.wavelength_nm.tolist() == WAVES
+    assert_rejected(path, "has no array 'data.part.cub'; did you mean 'data.part.cube'", name="data.part.cub")
+    assert_rejected(path, "has no array 'data.none.cube'", name="data.none.cube")
+    assert_rejected(path, r"select the field of a struct with name=, such as 'data\.(part|other)'")
+    save(path, {"data": {**inner, "scale": 2.0}})
+    assert_rejected(path, "has the number 'data/scale', which may change the values", name="data.cube")
+
+
+# -- folders of pictures ----------------------------------------------------------------------------------------------
+
+
+def write_bands(path, names, values=VALUES):
+    path.mkdir(exist_ok=True)
+    for name, band in zip(names, values, strict=True):
+        write_band(path / name, band)
+    return path
+
+
+def write_band(path, band):
+    if path.suffix == ".tif":
+        tifffile.imwrite(path, band.astype(np.uint16), photometric="minisblack")
+    else:
+        Image.fromarray(band.astype(np.uint16)).save(path)
+
+
+def test_folder_of_pictures_is_a_cube(tmp_path):
+    """The layout of CAVE: 16-bit PNG per band, numbered from 1, beside a colour picture."""
+    values = 1000.0 * np.concatenate([VALUES] * 4)
+    path = write_bands(tmp_path / "balloons", [f"balloons_ms_{k}.png" for k in range(1, 13)], values)
+    (path / "balloons_RGB.bmp").write_bytes(b"BM")
+    waves_nm = [400.0 + 10.0 * k for k in range(12)]
+    lit = {
+        "distance_m": 1.0,
+        "quantity": "reflectance",
+        "illuminant": "E",
+        "radiance_w_m2_sr_nm": 0.5,
+        "scale": 1.0 / 65535,
+    }
+    scene = Scene.from_cube(path, wavelength_nm=waves_nm, **lit)
+
+    np.testing.assert_allclose(radiance(scene), 0.5 * values / 65535, rtol=1e-6)
+    assert scene.wavelength_nm.tolist() == waves_nm
+    assert_rejected(path, r"does not specify the wavelengths of its bands; pass wavelength_nm=\.\.\., 12 values in nm")
+
+
+def test_names_of_pictures_contain_wavelengths(tmp_path):
+    path = write_bands(tmp_path / "field", ["a_1_650nm.tif", "a_2_450 nm.tif", "a_3_550.5nm.tif"])
+    scene = Scene.from_cube(path, **RADIANCE)
+    assert scene.wavelength_nm.tolist() == [450.0, 550.5, 650.0]
+    np.testing.assert_array_equal(radiance(scene), VALUES[[1, 2, 0]])
+    assert Scene.from_cube(path, name="a_[23]*", **RADIANCE).wavelength_nm.tolist() == [450.0, 550.5]
+
+
+def with_chunk(path, name, data):
+    """Insert a chunk after the header of a PNG file."""
+    content = path.read_bytes()
+    chunk = struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+    path.write_bytes(content[:33] + chunk + content[33:])
+
+
+def test_wrong_folders_give_one_line(tmp_path):
+    path, options = write_bands(tmp_path / "f", ["1.png", "2.png", "3.png"]), {"wavelength_nm": WAVES}
+    Image.new("RGB", (5, 4)).save(path / "4.png")
+    assert_rejected(path, "has a picture '4.png' of 3 channels, expected one number per pixel; select grey", **options)
+    (path / "4.png").unlink()
+    with_chunk(path / "2.png", b"gAMA", struct.pack(">I", 45455))
+    assert_rejected(
+        path, r"has a picture '2.png' with a transfer function \(the chunk gAMA\), which changes", **options
+    )
+    write_bands(path, ["2.png"], VALUES[1:2, :2])
+    assert_rejected(path, "contains bands of different kinds: '1.png' has .*, '2.png' ", **options)
+    (path / "2.png").write_bytes((path / "1.png").read_bytes()[:-20])
+    assert_rejected(path, "has a picture '2.png' that is corrupt or truncated", **options)
+    write_band(path / "2.tif", VALUES[1])
+    assert_rejected(path, r"contains pictures of several kinds, \.png, \.tif; select some with name=", **options)
+    assert_rejected(path, r"contains no PNG or TIFF pictures with names like '\*\.bmp'", name="*.bmp")
+
+
 def test_every_format_has_an_entry():
-    assert set(CUBE_FORMATS) >= {"envi", "exr", "netcdf", "zarr", "mat73", "mat"}
+    assert set(CUBE_FORMATS) >= {"envi", "exr", "folder", "netcdf", "zarr", "mat73", "mat"}
     assert set(_envi.TYPES) == {1, 2, 3, 4, 5, 12, 13, 14, 15}
 
 

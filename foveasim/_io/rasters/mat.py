@@ -45,12 +45,13 @@ class MatFile:
 
     ``names``: variables. ``shapes``: shapes, in the order of MATLAB, of those that are plain numeric arrays. ``read``:
     function that returns a variable, or a field such as ``oi/optics/focalLength``; None if it is missing or not an array of
-    numbers or text.
+    numbers or text. ``fields``: function that returns the names of the fields of a struct; empty for others.
     """
 
     names: list[str]
     shapes: dict[str, tuple[int, ...]]
     read: Callable[[str], NDArray[Any] | None]
+    fields: Callable[[str], list[str]]
 
 
 @contextmanager
@@ -70,21 +71,32 @@ def _open_mat5(path: Path) -> Iterator[MatFile]:
             source = BytesIO(_decompress(path))
         return loadmat(source, variable_names=[name], struct_as_record=False, squeeze_me=False)[name]
 
-    def read(field: str) -> NDArray[Any] | None:
+    def part_of(field: str) -> Any:
         first, *rest = field.split("/")
         if first not in classes:
             return None
         if first not in variables:
             variables[first] = load(first)
-        part: Any = variables[first]
+        part = _only(variables[first])
         for key in rest:
-            if isinstance(part, np.ndarray) and part.dtype == object and part.size == 1:
-                part = part.ravel()[0]
-            part = getattr(part, key, None) if key in getattr(part, "_fieldnames", ()) else None
+            part = _only(getattr(part, key, None)) if key in getattr(part, "_fieldnames", ()) else None
+        return part
+
+    def read(field: str) -> NDArray[Any] | None:
+        part = part_of(field)
         return part if isinstance(part, np.ndarray) and part.dtype.kind in "iufcU" else None
 
+    def fields(field: str) -> list[str]:
+        return list(getattr(part_of(field), "_fieldnames", ()))
+
     shapes = {name: shape for name, (shape, kind) in classes.items() if kind in CLASS_BYTES and kind != "char"}
-    yield MatFile(names=list(classes), shapes=shapes, read=read)
+    yield MatFile(names=list(classes), shapes=shapes, read=read, fields=fields)
+
+
+def _only(part: Any) -> Any:
+    """Return the struct of an array of one, and other values unchanged."""
+    is_struct = isinstance(part, np.ndarray) and part.dtype == object and part.size == 1
+    return part.ravel()[0] if is_struct else part
 
 
 @contextmanager
@@ -94,12 +106,20 @@ def _open_mat73(path: Path) -> Iterator[MatFile]:
     n_bytes = path.stat().st_size
     with h5py.File(path, "r") as file:
 
-        def dataset(field: str) -> Any:
+        def part_of(field: str) -> Any:
             part: Any = file
             for key in field.split("/"):
                 if not isinstance(part, h5py.Group) or not isinstance(part.get(key, getlink=True), h5py.HardLink):
                     return None
                 part = part[key]
+            return part
+
+        def fields(field: str) -> list[str]:
+            part = part_of(field)
+            return list(part) if isinstance(part, h5py.Group) else []
+
+        def dataset(field: str) -> Any:
+            part = part_of(field)
             is_plain = isinstance(part, h5py.Dataset) and not (part.external or part.is_virtual)
             return part if is_plain and part.dtype.kind in "iuf" else None
 
@@ -116,7 +136,7 @@ def _open_mat73(path: Path) -> Iterator[MatFile]:
 
         found = {name: part for name in file if (part := dataset(name)) is not None and not is_text(part)}
         shapes = {name: tuple(map(int, part.shape[::-1])) for name, part in found.items()}
-        yield MatFile(names=list(file), shapes=shapes, read=read)
+        yield MatFile(names=[name for name in file if name != "#refs#"], shapes=shapes, read=read, fields=fields)
 
 
 # -- structs of ISETCam -------------------------------------------------------------------------------------------------

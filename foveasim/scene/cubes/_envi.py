@@ -2,15 +2,17 @@
 ENVI cubes: a text header ``.hdr`` and a file of raw data, which is mapped into memory.
 
 The header is the file that is opened, or is found by the name of the data: ``a.img`` and ``a.hdr`` or ``a.img.hdr``. The data
-file has the size that the header specifies. Supported are interleaves bsq, bil and bip, all real data types, byte order, header
-offset, wavelengths with their units, ``bbl``, ``data ignore value``, ``data gain values``, ``data offset values`` and
-``reflectance scale factor``; the unit of radiance is read from ``data units``. Map information is ignored.
+file has the size that the header specifies. Keys are those of :data:`UNDERSTOOD`, in any case; the unit of radiance is read
+from ``data units``. Gains and offsets of reflectance apply where there are none of radiance. Keys of :data:`IRRELEVANT` do not
+change the values, and neither do other keys, unless one of :data:`RELEVANT` is in their names, which is an error. Lists may
+begin on the line after their key, and have commas or blanks between their values.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,8 @@ from foveasim._io.mapped_files import map_file
 from foveasim.scene.cubes._cube import EXAMPLE_NM, EXAMPLE_UNIT, Cube, Quantity, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
-MAGIC = b"ENVI"
+#: First bytes of headers, which may follow a byte order mark.
+MAGIC, MAGIC_BYTES = b"ENVI", 7
 MAX_HEADER_BYTES = 2**22
 #: dtypes by ``data type``; 6 and 9 are complex.
 TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
@@ -39,12 +42,39 @@ DATA_SUFFIXES = ("", ".img", ".dat", ".raw", ".bin", ".bsq", ".bil", ".bip", ".c
 #: Names of the unit of radiance, which the format does not define.
 UNIT_KEYS = ("data units", "data unit", "radiance units", "units")
 MAX_SIZE = 2**40
+#: Keys that are read.
+UNDERSTOOD = frozenset((
+    "samples", "lines", "bands", "header offset", "file type", "data type", "interleave", "byte order", "wavelength",
+    "wavelength units", "data gain values", "data offset values", "data reflectance gain values",
+    "data reflectance offset values", "reflectance scale factor", "bbl", "data ignore value", "file compression",
+    "major frame offsets", "minor frame offsets",
+    *UNIT_KEYS,
+))  # fmt: skip
+#: Keys that do not change the values: where the scene is (its distance and pitch are those of the caller), the sensor's bands,
+#: whose widths are not those of the spectrum between them, names, display, time and weather; settings of Specim's cameras.
+IRRELEVANT = frozenset((
+    "map info", "projection info", "coordinate system string", "geo points", "pixel size", "rpc info", "x start", "y start",
+    "dem file", "dem band", "fwhm", "sensor type", "sensor", "sensorid", "band names", "spectra names", "description",
+    "default bands", "default stretch", "z plot range", "z plot average", "z plot titles", "plot range", "plot average",
+    "plot titles", "sun azimuth", "sun elevation", "solar irradiance", "cloud cover", "acquisition time", "acquisition date",
+    "timestamp", "security tag", "product type", "history", "fps", "tint", "binning", "himg", "vimg", "hroi", "vroi", "errors",
+    "fodis", "trigger mode", "temperature", "gps start time", "gps stop time", "spatial binning", "spectral binning",
+))  # fmt: skip
+#: Parts of the names of keys that change the values.
+RELEVANT = re.compile(
+    r"gain|offset|scal|factor|unit|wave|byte|interleave|compress|mask|ignore|calib|quanti|radian|reflect|irrad|order|type|rotat|"
+    r"mirror|flip|class|complex|procedure|encod|gamma|\blog|dark|linear"
+)
 
 
 def is_envi(path: Path, head: bytes) -> bool:
     """Return whether a file is a header, or data with a header."""
     is_data = path.is_file() and path.suffix.lower() in DATA_SUFFIXES
-    return head.startswith(MAGIC) or (is_data and _header_of(path) is not None)
+    return _begins_with_magic(head) or (is_data and _header_of(path) is not None)
+
+
+def _begins_with_magic(head: bytes) -> bool:
+    return head.removeprefix(b"\xef\xbb\xbf").startswith(MAGIC)
 
 
 def read_envi(path: Path, name: str | None) -> Cube:
@@ -52,15 +82,20 @@ def read_envi(path: Path, name: str | None) -> Cube:
     if name is not None:
         raise FormatError("contains one unnamed cube; omit name=")
     with path.open("rb") as file:
-        is_header = file.read(len(MAGIC)) == MAGIC
+        is_header = _begins_with_magic(file.read(MAGIC_BYTES))
     header_path = path if is_header else _header_of(path)
     assert header_path is not None
     entries = _entries(header_path)
     data_path = _data_of(header_path) if is_header else path
+    scale: Any
+    offset: Any
     unit = next((entries[key].strip("{} ") for key in UNIT_KEYS if key in entries), None)
     quantity: Quantity | None = None
-    scale: Any = _band_numbers(entries, "data gain values") or 1.0
-    offset: Any = _band_numbers(entries, "data offset values") or 0.0
+    scale, offset = (_band_numbers(entries, f"data {name} values") for name in ("gain", "offset"))
+    of_reflectance = [_band_numbers(entries, f"data reflectance {name} values") for name in ("gain", "offset")]
+    if scale is None and offset is None and of_reflectance != [None, None]:
+        (scale, offset), quantity, unit = of_reflectance, "reflectance", None
+    scale, offset = (default if values is None else values for values, default in ((scale, 1.0), (offset, 0.0)))
     factor = _number(entries, "reflectance scale factor")
     if factor is not None:
         if not factor > 0.0:
@@ -86,20 +121,40 @@ def _entries(path: Path) -> dict[str, str]:
     """Return the entries of a header with keys in lower case."""
     if path.stat().st_size > MAX_HEADER_BYTES:
         raise FormatError(f"has a header of {path.stat().st_size} bytes, more than {MAX_HEADER_BYTES}")
-    text = path.read_bytes().decode("utf-8", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+    content = path.read_bytes()
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
     if not text.startswith("ENVI"):
         raise FormatError(f"has the header {path.name!r}, which does not begin with ENVI")
-    lines = (line for line in text.split("\n") if not line.startswith(";"))
-    entries = {}
-    for line in lines:
-        key, equals, value = line.partition("=")
+    lines = deque(line for line in text.split("\n") if line.strip() and not line.lstrip().startswith(";"))
+    entries: dict[str, str] = {}
+    while lines:
+        name, equals, value = lines.popleft().partition("=")
         if not equals:
             continue
-        parts = [value.strip()]
+        key, parts = " ".join(name.lower().split()), [value.strip()]
+        if not parts[0] and lines and lines[0].lstrip().startswith("{"):
+            parts = [lines.popleft().strip()]
         while parts[0].startswith("{") and "}" not in parts[-1]:
-            parts.append(next(lines, "}"))
-        entries[" ".join(key.lower().split())] = " ".join(parts)
+            parts.append(lines.popleft() if lines else "}")
+        value = " ".join(parts)
+        if entries.setdefault(key, value) != value:
+            raise FormatError(f"has two values of {key!r:.40}, {entries[key]!r:.40} and {value!r:.40}; remove one")
+    _check_keys(entries)
     return entries
+
+
+def _check_keys(entries: dict[str, str]) -> None:
+    """Raise a FormatError for a key that changes the values and is not known, or a file of another type."""
+    for key in entries:
+        if key not in UNDERSTOOD and key not in IRRELEVANT and RELEVANT.search(key):
+            raise FormatError(f"has the unknown key {key!r:.60}, which may change the values; remove it if it does not")
+    kind = entries.get("file type", "").strip("{} ")
+    if kind.lower() not in ("", "envi", "envi standard"):
+        raise FormatError(f"has the 'file type' {kind!r:.40}, expected ENVI Standard, an image of numbers")
 
 
 def _map(path: Path, entries: dict[str, str]) -> NDArray[Any]:
@@ -145,7 +200,7 @@ def _header_of(path: Path) -> Path | None:
     for candidate in (path.with_name(path.name + ".hdr"), path.with_suffix(".hdr"), path.with_suffix(".HDR")):
         if candidate != path and candidate.is_file():
             with candidate.open("rb") as file:
-                if file.read(len(MAGIC)) == MAGIC:
+                if _begins_with_magic(file.read(MAGIC_BYTES)):
                     return candidate
     return None
 
@@ -197,7 +252,7 @@ def _numbers(entries: dict[str, str], key: str) -> list[float] | None:
     """Return a number or a list in braces."""
     if key not in entries:
         return None
-    parts = [part.strip() for part in entries[key].strip().strip("{}").split(",")]
+    parts = re.split(r"[,\s]+", entries[key].strip().strip("{}"))
     try:
         return [float(part) for part in parts if part]
     except ValueError:

@@ -4,13 +4,15 @@ Cubes in MAT files: scenes of ISETCam, and arrays (row, column, band), top row f
 A scene is the struct ``scene`` or its fields: ``data.photons`` are photons/(s m² sr nm), ``spectrum.wave`` is in nm,
 ``wAngular`` is the horizontal field of view in degrees, and ``distance`` is in m.
 
-Otherwise the cube is the only array of three dimensions, or the one with the given name. Wavelengths in nm are the variable
-``wavelengths``, ``wave``, ``bands`` or another usual name; if only the first axis has as many elements, it is that of the
-bands. A variable ``unit`` or ``units`` contains the unit.
+Otherwise the cube is the only array of three dimensions, or the one with the given name, which is also that of a field of a
+struct: ``data.cube``. Wavelengths in nm are the variable, or the field of the same struct, ``wavelengths``, ``wave``, ``bands``
+or another usual name; if only the first axis has as many elements, it is that of the bands. ``unit`` or ``units`` contains the
+unit. Other variables are ignored, unless their names are those of :data:`FACTORS`, which change the values.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -30,12 +32,16 @@ WAVELENGTHS = (
     *("bands", "band", "wavelist"),
 )
 UNITS = ("unit", "units")
+#: Names of numbers by which the values of a cube may be multiplied or displaced; they have no defined meaning.
+FACTORS = ("scale", "scale_factor", "scalefactor", "factor", "gain", "offset", "add_offset", "fill_value", "nodata")
 ISET_UNIT = "photons s-1 m-2 sr-1 nm-1"
 
 
 def _read(file: MatFile, name: str | None) -> Cube:
+    if name is not None and re.search(r"[./]", name):
+        return _array(file, name)
     is_struct = {n for n in file.names if n not in file.shapes}
-    has_fields = "photons" in file.names or "data" in is_struct
+    has_fields = "photons" in (*file.names, *file.fields("data"))
     if name in is_struct or (name is None and (is_struct & set(SCENE) or has_fields)):
         return _scene(file, name)
     return _array(file, name)
@@ -57,20 +63,16 @@ def _scene(file: MatFile, name: str | None) -> Cube:
 
 
 def _array(file: MatFile, name: str | None) -> Cube:
-    cubes = [n for n, shape in file.shapes.items() if len(shape) == 3]
-    if name is None:
-        if len(cubes) != 1:
-            listed = f": {', '.join(n[:40] for n in cubes[:5])}; select one with name=" if cubes else ""
-            raise FormatError(f"contains {len(cubes)} arrays of rows, columns and bands{listed}")
-        name = cubes[0]
-    elif name not in file.shapes:
-        raise FormatError(f"has no array {name!r:.40}; {possible_names(name, cubes or list(file.shapes))}")
-    by_lower = {n.lower(): n for n in file.names if n != name}
-    key = next((by_lower[n] for n in WAVELENGTHS if n in by_lower and by_lower[n] in file.shapes), None)
-    waves = None if key is None else file.read(key)
-    unit = next((by_lower[n] for n in UNITS if n in by_lower), None)
-    text = None if unit is None else file.read(unit)
-    data = file.read(name)
+    path, beside = _place(file, name)
+    by_lower = {n.lower(): f"{path.rpartition('/')[0]}/{n}".lstrip("/") for n in beside}
+    waves = next((v for n in WAVELENGTHS if n in by_lower and (v := _numbers(file, by_lower[n])) is not None), None)
+    text = next((v for n in UNITS if n in by_lower and (v := file.read(by_lower[n])) is not None), None)
+    for factor in FACTORS:
+        if factor in by_lower and _numbers(file, by_lower[factor]) is not None:
+            raise FormatError(
+                f"has the number {by_lower[factor]!r:.40}, which may change the values; read the array, and pass it with scale="
+            )
+    data = file.read(path)
     assert data is not None
     n_waves = None if waves is None else waves.size
     is_first = data.ndim == 3 and data.shape[2] != n_waves and data.shape[0] == n_waves
@@ -79,6 +81,33 @@ def _array(file: MatFile, name: str | None) -> Cube:
         wavelength=None if waves is None else waves.ravel().tolist(),
         unit="".join(text.ravel().tolist()) if text is not None and text.dtype.kind == "U" else None,
     )
+
+
+def _place(file: MatFile, name: str | None) -> tuple[str, list[str]]:
+    """Return the path of the array with a name, or of the only one, and the names beside it."""
+    cubes = [n for n, shape in file.shapes.items() if len(shape) == 3]
+    if name is None:
+        if len(cubes) != 1:
+            listed = f": {', '.join(n[:40] for n in cubes[:5])}; select one with name=" if cubes else ""
+            structs = [n for n in file.names if file.fields(n)]
+            if not cubes and structs:
+                field = file.fields(structs[0])[0]
+                listed = f"; select the field of a struct with name=, such as '{structs[0]:.40}.{field:.40}'"
+            raise FormatError(f"contains {len(cubes)} arrays of rows, columns and bands{listed}")
+        name = cubes[0]
+    *struct, last = re.split(r"[./]", name)
+    beside = file.fields("/".join(struct)) if struct else file.names
+    path = "/".join((*struct, last))
+    if last not in beside or _numbers(file, path) is None:
+        known = [".".join((*struct, n)) for n in beside] if struct else cubes or list(file.shapes)
+        raise FormatError(f"has no array {name!r:.40}; {possible_names(name, known)}")
+    return path, [n for n in beside if n != last]
+
+
+def _numbers(file: MatFile, path: str) -> np.ndarray[Any, Any] | None:
+    """Return an array of numbers, or None."""
+    values = file.read(path)
+    return values if values is not None and values.dtype.kind in "iufc" else None
 
 
 def _bands_first(data: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
