@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.images import pixels_of_page
 from foveasim._io.rasters import MAX_BANDS, check_size
+from foveasim._io.rasters.tiff import check_page, missing_value
 from foveasim.fields import PowerMap, to_file_rows
 from foveasim.maps._common import Found
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._json_metadata import found_in_metadata, map_metadata
 
 MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-#: TIFF tag of the orientation, and its values for top row first and bottom row first.
-ORIENTATION_TAG, TOP_FIRST, BOTTOM_FIRST = 274, 1, 4
 #: Maximum data size of a classic TIFF: 4 GiB minus a reserve for metadata.
 CLASSIC_BYTES = 2**32 - 2**24
 
@@ -61,8 +60,6 @@ def read(path: Path, name: str | None) -> Found:
         for page in pages:
             if page.shape != first.shape or page.dtype != first.dtype or page.dtype is None:
                 raise FormatError("contains pages of different sizes or dtypes; write one equal page per band")
-            if page.photometric not in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB):
-                raise FormatError("has an unsupported photometric interpretation; save values with 0 as black")
         check_size((n_pages, *first.shape), first.dtype.itemsize, n_bytes)
         if n_pages > 1 and first.ndim != 2:
             raise FormatError(f"contains {n_pages} pages of shape {first.shape}, expected (n_y, n_x) per band")
@@ -70,11 +67,14 @@ def read(path: Path, name: str | None) -> Found:
         data = images[0][np.newaxis] if n_pages == 1 else np.stack(images)
         if first.ndim == 3:
             data = _samples_first(data[0], first, tifffile)
-        orientation = first.tags[ORIENTATION_TAG].value if ORIENTATION_TAG in first.tags else TOP_FIRST
+        is_top_first = {check_page(page) for page in pages}
+        missing = missing_value(first)
         description = str(first.description)
-    if orientation not in (TOP_FIRST, BOTTOM_FIRST):
-        raise FormatError(f"has the unsupported orientation {orientation!s:.10}; save it with orientation 1 or 4")
-    return found_in_metadata(description, data, is_y_descending=orientation == TOP_FIRST)
+    if len(is_top_first) > 1:
+        raise FormatError("contains pages of different orientations; write one equal page per band")
+    if missing is not None and (data == missing).any():
+        raise FormatError(f"contains pixels without data, {missing:g} by GDAL_NODATA; replace them")
+    return found_in_metadata(description, data, is_y_descending=is_top_first.pop())
 
 
 def _samples_first(data: NDArray[Any], page: Any, tifffile: Any) -> NDArray[Any]:

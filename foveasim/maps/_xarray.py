@@ -19,6 +19,7 @@ from foveasim._io.rasters.labels import (
     squeeze,
     unit_of_array,
     wavelengths_of_array,
+    with_attributes,
 )
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, Pitch, PowerMap
@@ -134,7 +135,7 @@ def found_in_array(array: xr.DataArray) -> Found:
 
     Raises FormatError if the dimensions are not those of a map, or the coordinates are not uniform.
     """
-    array = squeeze(array)
+    array = with_attributes(squeeze(array))
     if is_unnamed(array):
         return Found(data=array.to_numpy(), unit=unit_of_array(array))
     array, band, (y, x) = in_order(array)

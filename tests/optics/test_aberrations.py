@@ -158,12 +158,16 @@ def test_defocused_psf_centre_is_squared_sinc(waves):
 
 def test_tilt_does_not_change_the_strehl_ratio():
     """Coma contains tilt, and distortion is tilt: the image is displaced."""
-    ratios = [aberrated(coefficients={7: 0.3, 3: tilt}, unit="waves").strehl(WAVELENGTH_NM) for tilt in (0.0, 0.4, -1.0)]
+    ratios = [
+        aberrated(coefficients={7: 0.3, 3: tilt}, unit="waves").strehl(WAVELENGTH_NM) for tilt in (0.0, 0.4, -1.0)
+    ]
     assert ratios == pytest.approx([ratios[0]] * 3, rel=1e-6)
     assert aberrated(coefficients={2: 0.7}, unit="waves").strehl(WAVELENGTH_NM) == pytest.approx(1.0, abs=2e-6)
     coma = aberrated(coefficients={7: 0.3}, unit="waves")
     # Dense samples of the PSF, λN/32 apart.
-    dense = coma.psf(WAVELENGTH_NM, pitch_um=LAMBDA_N_UM / 32, n_points=257).psf_per_um2.max() * LAMBDA_N_UM**2 * 4 / np.pi
+    dense = (
+        coma.psf(WAVELENGTH_NM, pitch_um=LAMBDA_N_UM / 32, n_points=257).psf_per_um2.max() * LAMBDA_N_UM**2 * 4 / np.pi
+    )
     assert ratios[0] == pytest.approx(dense, rel=1e-3)
     assert coma.strehl(WAVELENGTH_NM, reference="image_point") == pytest.approx(0.0128, abs=1e-4)
     with pytest.raises(ParameterError, match="'reference' must be one of 'peak', 'image_point', got 'centre'"):

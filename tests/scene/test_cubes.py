@@ -376,7 +376,7 @@ def test_missing_files_give_one_line(tmp_path):
     (tmp_path / "text.hdr").write_text("#?RADIANCE\n")
     assert_rejected(
         tmp_path / "text.hdr",
-        "not a valid hyperspectral cube: expected ENVI, EXR, MAT, netCDF, numpy array, TIFF or zarr",
+        "not a valid hyperspectral cube: expected ENVI, EXR, folder of pictures, MAT, netCDF, numpy array, TIFF or zarr",
     )
     for name in ("cube.dat", "cube.raw"):
         (tmp_path / name).write_bytes(bytes(240))
@@ -885,6 +885,81 @@ def test_matlab_structs_contain_cubes(tmp_path, save):
     assert_rejected(path, r"select the field of a struct with name=, such as 'data\.(part|other)'")
     save(path, {"data": {**inner, "scale": 2.0}})
     assert_rejected(path, "has the number 'data/scale', which may change the values", name="data.cube")
+
+
+# -- attributes and tags that change the values -----------------------------------------------------------------------
+
+
+def test_packed_netcdf_values_are_scaled(tmp_path):
+    """CF conventions, section 8.1: scale factor, offset, fill value and range of packed values."""
+    array = labelled()
+    encoding = {"dtype": "int16", "scale_factor": 0.5, "add_offset": 10.0, "_FillValue": -999}
+    array.to_dataset(name="cube").to_netcdf(tmp_path / "cube.nc", engine="h5netcdf", encoding={"cube": encoding})
+    np.testing.assert_allclose(radiance(Scene.from_cube(tmp_path / "cube.nc", **RADIANCE)), VALUES, atol=0.26)
+
+    array.attrs["valid_range"] = np.array([-20, 60], np.int16)  # from 0 to 40 after unpacking
+    array.to_dataset(name="cube").to_netcdf(tmp_path / "cube.nc", engine="h5netcdf", encoding={"cube": encoding})
+    assert_rejected(tmp_path / "cube.nc", r"got nan at \[band, row, column\] = \[2, 0, 1\], 19 such values")
+    scene = Scene.from_cube(tmp_path / "cube.nc", invalid="zero", **RADIANCE)
+    assert radiance(scene).max() == 40.0
+
+
+@pytest.mark.parametrize("name", ["radiometric_gain", "Slope", "calibration_offset", "nodata_value"])
+def test_unknown_attributes_of_arrays_are_reported(tmp_path, name):
+    array = labelled()
+    array.attrs[name] = 2.0
+    array.to_dataset(name="cube").to_netcdf(tmp_path / "cube.nc", engine="h5netcdf")
+    assert_rejected(tmp_path / "cube.nc", f"has the attribute '{name}', which may change the values", unit=None)
+    array.attrs.pop(name)
+    array.attrs |= {"history": "written", "comment": "a field", "wavelength_units": "nm"}
+    assert Scene.from_cube(array, distance_m=1.0).basis.shape == VALUES.shape
+
+
+@pytest.mark.parametrize(
+    ("attributes", "match"),
+    [
+        ({"exposureCompensation": 1.5}, "has the attribute 'exposureCompensation', which may change the values"),
+        ({"cameraResponse": "1nm:2"}, "has the attribute 'cameraResponse', which may change the values"),
+        ({"pixelAspectRatio": 2.0}, "has pixels with the pixelAspectRatio 2, expected squares"),
+    ],
+)
+def test_exr_attributes_that_change_values_are_reported(tmp_path, attributes, match):
+    channels = {f"S0.{wave_nm:g}nm": band.astype(np.float32) for wave_nm, band in zip(WAVES, VALUES, strict=True)}
+    header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage, "expTime": 0.1, "owner": "someone"}
+    for more, is_good in (({}, True), (attributes, False)):
+        with OpenEXR.File({**header, **more}, channels) as file:
+            file.write(str(tmp_path / "cube.exr"))
+        if is_good:
+            np.testing.assert_array_equal(radiance(Scene.from_cube(tmp_path / "cube.exr", **RADIANCE)), VALUES)
+        else:
+            assert_rejected(tmp_path / "cube.exr", match)
+
+
+def write_tiff(path, **options):
+    tifffile.imwrite(path, VALUES.astype(np.float32), **{"photometric": "minisblack", **options})
+    return path
+
+
+def test_tiff_tags_decide_rows_and_missing_pixels(tmp_path):
+    options = {**RADIANCE, "wavelength_nm": WAVES}
+    path = write_tiff(tmp_path / "cube.tif", extratags=[(274, "H", 1, 4)])
+    np.testing.assert_array_equal(radiance(Scene.from_cube(path, **options)), VALUES[:, ::-1])
+    path = write_tiff(tmp_path / "cube.tif", extratags=[(42113, "s", 0, "7")])
+    assert_rejected(path, r"got 7 at \[band, row, column\] = \[0, 1, 2\], 1 such values", wavelength_nm=WAVES)
+    for tag, match in (
+        ((42113, "s", 0, "none"), "has the tag GDAL_NODATA = 'none', expected a number"),
+        (
+            (42112, "s", 0, '<GDALMetadata><Item name="SCALE" role="scale">0.1</Item></GDALMetadata>'),
+            "has the scale 0.1 in GDAL",
+        ),
+        ((34675, "B", 4, b"icc!"), r"has a colour profile .* \(InterColorProfile\), the tag 34675"),
+        ((301, "H", 6, tuple(range(6))), r"has a transfer function \(TransferFunction\), the tag 301"),
+        ((274, "H", 1, 6), "has the unsupported orientation 6"),
+    ):
+        assert_rejected(write_tiff(tmp_path / "cube.tif", extratags=[tag]), match, wavelength_nm=WAVES)
+    assert_rejected(
+        write_tiff(tmp_path / "cube.tif", photometric="miniswhite"), "unsupported photometric", wavelength_nm=WAVES
+    )
 
 
 # -- folders of pictures ----------------------------------------------------------------------------------------------

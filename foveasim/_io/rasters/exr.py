@@ -1,4 +1,10 @@
-"""EXR files: header with size limits, and channels as bands."""
+"""
+EXR files: header with size limits, and channels as bands.
+
+The library applies the compression and the line order. Read are the windows, the channels, ``pixelAspectRatio`` and, by the
+readers, ``emissiveUnits``. Other attributes do not change the values, unless one of :data:`RELEVANT` is in their names, which
+is an error.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +31,13 @@ CHANNEL = re.compile(
 POLARISATION = ("S1", "S2", "S3")
 #: Bytes of a 32-bit channel value.
 ITEMSIZE = 4
+#: Parts of the names of attributes that change the values, such as those of cameras in spectral EXR.
+RELEVANT = re.compile(
+    r"gain|offset|scale|factor|units?$|response|transmission|sensitivit|exposurecomp|calib|gamma|encod|invert|logarithm|dark",
+    re.IGNORECASE,
+)
+#: Attributes with such names that are read, or do not change the values: units of what is reflected, of foveasim's maps.
+NOT_RELEVANT = frozenset(("emissiveUnits", "foveasim"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,12 +63,26 @@ def read_header(path: Path) -> ExrHeader:
         n_x, n_y = (high - low + 1).tolist()
         channels = [channel.name for channel in header["channels"]]
         attributes = {key: value for key, value in header.items() if isinstance(value, str)}
+        _check_attributes(header)
     if len(channels) > MAX_BANDS or min(n_x, n_y) < 1:
         raise FormatError(
             f"must have at most {MAX_BANDS} channels of at least 1 x 1, got {len(channels)} of {n_x} x {n_y}"
         )
     check_size((len(channels), n_y, n_x), ITEMSIZE, path.stat().st_size)
     return ExrHeader(channels=channels, attributes=attributes)
+
+
+def _check_attributes(header: dict[str, Any]) -> None:
+    """Raise a FormatError for an attribute that changes the values or the pixels, and is not known."""
+    for name in map(str, header):
+        if name not in NOT_RELEVANT and RELEVANT.search(name):
+            raise FormatError(f"has the attribute {name!r:.60}, which may change the values; apply it, and remove it")
+    aspect = float(header.get("pixelAspectRatio", 1.0))
+    if aspect != 1.0:
+        raise FormatError(f"has pixels with the pixelAspectRatio {aspect:g}, expected squares; resample it")
+    kind = str(header.get("type", "")).rpartition(".")[2]
+    if "deep" in kind.lower():
+        raise FormatError(f"contains a deep image, of the type {kind:.40}, expected one value per pixel")
 
 
 def band_of_channel(name: str) -> tuple[str, float] | None:

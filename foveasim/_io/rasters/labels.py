@@ -1,9 +1,16 @@
-"""Dimensions, coordinates and units of labelled arrays (wavelength, y, x)."""
+"""
+Dimensions, coordinates, units and attributes of labelled arrays (wavelength, y, x).
+
+xarray applies ``scale_factor``, ``add_offset``, ``_FillValue``, ``missing_value`` and ``_Unsigned`` of files (CF conventions,
+section 8.1); values outside ``valid_range``, ``valid_min`` and ``valid_max`` are missing. Other attributes do not change the
+values, unless one of :data:`RELEVANT` is in their names, which is an error.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Hashable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +27,52 @@ Y = ("y", "y_um", "row", "rows", "n_y")
 BAND = ("wavelength", "wavelength_nm", "wavelengths", "wave", "wl", "lambda", "band", "bands", "channel")
 #: Prefixes of names that libraries generate for unnamed dimensions.
 UNNAMED_PREFIXES = ("phony_dim_", "dim_")
+#: Attributes that are read; pitch and origin are those of foveasim's maps.
+UNDERSTOOD = frozenset(("units", "unit", "valid_range", "valid_min", "valid_max", "pitch_um", "origin_um"))
+#: Attributes with parts of :data:`RELEVANT` in their names that do not change the values: how they are displayed.
+IRRELEVANT = frozenset(
+    ("colour_scale", "color_scale", "scale_type", "units_metadata", "wavelength_units", "long_units")
+)
+#: Parts of the names of attributes that change the values.
+RELEVANT = re.compile(
+    r"gain|offset|scal|factor|slope|intercept|unit|fill|missing|nodata|no_data|mask|invalid|calib|quanti|gamma|log10|linear|dark",
+    re.IGNORECASE,
+)
+
+
+def with_attributes(array: xr.DataArray) -> xr.DataArray:
+    """
+    Return an array whose values are those that its attributes describe, NaN outside of the valid range.
+
+    Raises FormatError for an attribute that may change the values and is not known, or a range that is not numbers.
+    """
+    for name in map(str, array.attrs):
+        if name.lower() not in UNDERSTOOD | IRRELEVANT and RELEVANT.search(name):
+            raise FormatError(f"has the attribute {name!r:.60}, which may change the values; apply it, and remove it")
+    low, high = _range(array, "valid_min", 0), _range(array, "valid_max", 1)
+    if low is not None:
+        array = array.where(array >= low)
+    if high is not None:
+        array = array.where(array <= high)
+    return array
+
+
+def _range(array: xr.DataArray, name: str, end: int) -> float | None:
+    """Return an end of the valid range, which a file specifies for its packed values."""
+    value: Any = array.attrs.get(name)
+    if value is None and "valid_range" in array.attrs:
+        both = np.asarray(array.attrs["valid_range"])
+        value = both[end] if both.shape == (2,) else both
+    if value is None:
+        return None
+    if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf":
+        raise FormatError(f"has an invalid attribute 'valid_range' or '{name}', expected numbers")
+    return float(value) * float(array.encoding.get("scale_factor", 1.0)) + float(array.encoding.get("add_offset", 0.0))
+
+
+def text_of(value: Any) -> str | None:
+    """Return an attribute as text; None for other values."""
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value if isinstance(value, str) else None
 
 
 def squeeze(array: xr.DataArray) -> xr.DataArray:
@@ -68,8 +121,8 @@ def coordinate(array: xr.DataArray, name: Hashable) -> Floats | None:
 
 def length_of_coordinate(along: xr.DataArray, name: Hashable) -> float | None:
     """Return the unit of a coordinate in µm, or None if it is not a length."""
-    units = along.attrs.get("units")
-    return length_in_um(units) if isinstance(units, str) else 1.0 if str(name).endswith("_um") else None
+    units = text_of(along.attrs.get("units"))
+    return length_in_um(units) if units is not None else 1.0 if str(name).endswith("_um") else None
 
 
 def wavelengths_of_array(array: xr.DataArray, dimension: Hashable | None) -> list[float] | None:
@@ -91,5 +144,5 @@ def wavelengths_of_array(array: xr.DataArray, dimension: Hashable | None) -> lis
 
 def unit_of_array(array: xr.DataArray) -> str | None:
     """Return the attribute ``units`` or ``unit``, or None."""
-    units = array.attrs.get("units", array.attrs.get("unit"))
-    return units if isinstance(units, str) and units.strip() else None
+    units = text_of(array.attrs.get("units", array.attrs.get("unit")))
+    return units if units is not None and units.strip() else None

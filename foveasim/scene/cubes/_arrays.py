@@ -14,6 +14,7 @@ from foveasim._core.validation import Floats, as_any_array
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.images import TIFF_EXTENSIONS, check_picture_size
 from foveasim._io.npz import read_array
+from foveasim._io.rasters.tiff import check_page, missing_value
 from foveasim.errors import ParameterError
 from foveasim.scene.cubes._cube import EXAMPLE_NM, EXAMPLE_UNIT, Cube, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
@@ -67,10 +68,14 @@ def _read_tiff(path: Path, _name: str | None) -> Cube:
         if len(shape) != 3 or axes.count("Y") + axes.count("X") != 2:
             raise FormatError(f"contains an array of the axes {axes!r:.20}, expected rows, columns and bands")
         check_picture_size(path, int(np.prod(shape)), 1)
+        is_top_first = {check_page(page.keyframe) for page in series.pages if page is not None}
+        if len(is_top_first) > 1:
+            raise FormatError("contains pages of different orientations; write one equal page per band")
+        missing = missing_value(file.pages[0])
         values = series.asarray()
     band = next(k for k, name in enumerate(axes) if name not in "YX")
     order = (band, axes.index("Y"), axes.index("X"))
-    return Cube(data=values.transpose(order))
+    return Cube(data=values.transpose(order), is_y_descending=is_top_first.pop(), missing=missing)
 
 
 #: Metadata that these files lack.

@@ -25,7 +25,7 @@ from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.images import TIFF_EXTENSIONS, read_picture
 from foveasim._io.rasters import MAX_BANDS
 from foveasim.errors import FileError
-from foveasim.scene.cubes._cube import Cube, example_radiance
+from foveasim.scene.cubes._cube import EXAMPLE_UNIT, Cube, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
 
 PNG = ".png"
@@ -137,7 +137,7 @@ def _chunks(file: Path) -> list[bytes]:
     return found
 
 
-def _example(path: Path) -> Floats:
+def _example(path: Path) -> tuple[Floats, dict[str, Any]]:
     """Write 16-bit pictures, whose names contain wavelengths."""
     from PIL import Image
 
@@ -145,7 +145,7 @@ def _example(path: Path) -> Floats:
     path.mkdir()
     for wave_nm, band in zip((500, 600), radiance, strict=True):
         Image.fromarray(band[::-1].astype(np.uint16)).save(path / f"example_{wave_nm}nm.png")
-    return radiance
+    return radiance, {"unit": EXAMPLE_UNIT}
 
 
 CUBE_FORMATS.register(

@@ -28,7 +28,9 @@ from foveasim._io.rasters.labels import (
     is_unnamed,
     length_of_coordinate,
     squeeze,
+    text_of,
     unit_of_array,
+    with_attributes,
 )
 from foveasim.scene.cubes._cube import EXAMPLE_NM, EXAMPLE_UNIT, Cube, example_radiance
 from foveasim.scene.cubes._formats import CUBE_FORMATS
@@ -54,6 +56,7 @@ def cube_of_array(array: xr.DataArray, close: Callable[[], None] | None = None) 
 
     Raises FormatError if the dimensions are not those of a cube, or the positions are not uniform.
     """
+    array = with_attributes(array)
     if array.ndim == 3 and is_unnamed(array):  # datasets of HDF5 files without dimension scales, as numpy arrays
         array = array.rename(dict(zip(array.dims, ("y", "x", "band"), strict=True)))
     array, band, (y, x) = in_order(squeeze(array))
@@ -89,8 +92,8 @@ def _wavelengths(array: xr.DataArray, band: Hashable | None) -> tuple[list[float
         along = array.coords[name]
         if along.dims not in ((band,), ()) or along.dtype.kind not in "iuf":
             continue
-        unit = along.attrs.get("units", "nm" if str(name).endswith("_nm") else None)
-        return along.to_numpy().astype(float).ravel().tolist(), None if unit is None else str(unit)
+        unit = text_of(along.attrs.get("units", "nm" if str(name).endswith("_nm") else None))
+        return along.to_numpy().astype(float).ravel().tolist(), unit
     return None, None
 
 
