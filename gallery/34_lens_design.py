@@ -125,6 +125,7 @@ def triplet(waves_nm: tuple[float, ...], n_samples: int) -> fs.optics.PSFGrid:
         y_um=[1e3 * each[len(waves_nm) // 2][1] for each in found],
         wavelength_nm=waves_nm,
         pitch_um=PITCH_UM,
+        centre="fft",
         image="inverted",
         relative_illumination=[[each[w][2] / found[0][w][2] for w in range(len(waves_nm))] for each in found],
     )

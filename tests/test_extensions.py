@@ -143,7 +143,7 @@ def read_radiance(path, name, *, factor=1.0, top_row_first=True):
 
 
 def psfs_of(values, **changes):
-    about = {"x_um": 0.0, "y_um": 0.0, "wavelength_nm": 550.0, "pitch_um": 2.0, **changes}
+    about = {"x_um": 0.0, "y_um": 0.0, "wavelength_nm": 550.0, "pitch_um": 2.0, "centre": "fft", **changes}
     return PSFGrid.from_arrays(np.pad(values, 3), **about)
 
 
@@ -472,6 +472,7 @@ WRONG = [
     (PSF_FORMATS, text_format(lambda p: psfs_of(np.loadtxt(p))), write_psf, None, "returns other values; check that PSFs are up"),
     (PSF_FORMATS, text_format(lambda p: read_psf(p, x_um=5.0)), write_psf, None, "returns other points of the field"),
     (PSF_FORMATS, text_format(lambda p: read_psf(p, pitch_um=1.0)), write_psf, None, "returns other wavelengths or another dist"),
+    (PSF_FORMATS, text_format(lambda p: read_psf(p, centre=(3.9, 4.0))), write_psf, None, "returns another position of the image"),
     (PSF_FORMATS, text_format(lambda p: read_psf(p, samples="bins")), write_psf, None, "returns samples='bins'"),
     (PSF_FORMATS, text_format(lambda p: read_psf(p, relative_illumination=[[0.5]])), write_psf, None, "returns another relative"),
     (PSF_FORMATS, text_format(lambda _: psfs_of(np.ones((4, 4)))), write_psf, None, "returns PSFs of shape"),

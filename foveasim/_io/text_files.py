@@ -86,7 +86,7 @@ def _separator(line: str) -> str:
 
 
 def _without_trailing_cells(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
-    """Return rows without the empty cells that follow from a separator at the end of each line."""
+    """Return rows without the empty cells after a separator at the end of each line."""
     n_columns = max((len(row) for _, row in rows), default=0)
     has_end = [len(row) == n_columns and row[-1] == "" for _, row in rows]
     is_shorter = [len(row) == n_columns - 1 for _, row in rows]

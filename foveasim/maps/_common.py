@@ -118,7 +118,7 @@ def to_power_map(found: Found, given: Given) -> PowerMap:
 
 
 def _in_lengths(found: Found, given: Given) -> Found:
-    """Return a map in lengths; angles are multiplied by the focal length, the scale of a lens on its axis."""
+    """Return a map in lengths: angles times the focal length, the scale on the axis."""
     focal_mm = given.focal_length_mm
     if found.pitch_deg is None:
         if focal_mm is not None:

@@ -92,15 +92,15 @@ def _plane_values(header: Any, shape: tuple[int, ...]) -> dict[str, Any]:
     if axes is None:
         return {}
     metadata: dict[str, Any] = {"is_x_descending": axes.is_descending[0], "is_y_descending": axes.is_descending[1]}
-    metadata["pitch_deg" if axes.is_angle else "pitch_um"] = axes.pitch
-    if axes.zero is not None:
+    metadata["pitch_um"], metadata["pitch_deg"] = axes.pitch_um, axes.pitch_deg
+    if axes.zero_px is not None:
         origin = []
         for pitch, is_descending, zero, n in zip(
-            axes.pitch, axes.is_descending, axes.zero, shape[::-1][:2], strict=True
+            axes.steps, axes.is_descending, axes.zero_px, shape[::-1][:2], strict=True
         ):
             edges = (-0.5 - zero) * pitch, (n - 0.5 - zero) * pitch
             origin.append(-edges[1] if is_descending else edges[0])
-        metadata["origin_deg" if axes.is_angle else "origin_um"] = tuple(origin)
+        metadata["origin_um" if axes.pitch_deg is None else "origin_deg"] = tuple(origin)
     return metadata
 
 

@@ -513,9 +513,9 @@ class Scene:
         ----------
         path : path, (n_y, n_x, n_band) array, or xarray.DataArray
             ENVI header or data file, MAT file, scene of ISETCam, spectral EXR, netCDF or HDF5 file, zarr directory, numpy file,
-            or TIFF of several bands (:mod:`foveasim.scene.cubes`), detected from its content; or an array, top row first as in
-            pictures, which is copied. The dimensions of an xarray.DataArray have names, and coordinates may specify
-            wavelengths.
+            TIFF of several bands, or folder of pictures (:mod:`foveasim.scene.cubes`), detected from its content; or an array,
+            top row first as in pictures, which is copied. The dimensions of an xarray.DataArray have names, and coordinates may
+            specify wavelengths.
         axis : int
             Axis of the bands of an array.
         distance_m : float, optional, m
@@ -550,7 +550,8 @@ class Scene:
         rows, columns : (start, stop), optional
             Part of the image, in pixels from the top and from the left, without ``stop``.
         name : str, optional
-            Name of the variable, array or EXR layer, if the file contains several.
+            Name of the variable, array or EXR layer, if the file contains several: ``data.cube`` is a field of a struct in a
+            MAT file. For a folder of pictures, a pattern of their names.
         invalid : {"raise", "zero"}
             Whether NaN, infinite, negative and missing values are rejected or replaced by 0.
 

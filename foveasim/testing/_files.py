@@ -117,10 +117,12 @@ def _psf_difference(found: PSFGrid, expected: PSFGrid) -> str:
         return "returns other values; check that PSFs are upright, with row 0 as the lowest row"
     if not all(np.allclose(getattr(found, at), getattr(expected, at), atol=POSITION_UM) for at in ("x_um", "y_um")):
         return "returns other points of the field; check units, and that they are those of the upright picture"
-    if not np.allclose(found.wavelength_nm, expected.wavelength_nm) or not np.isclose(
-        found.pitch_um, expected.pitch_um
+    if not np.allclose(found.wavelength_nm, expected.wavelength_nm) or not np.allclose(
+        found.pitches_um, expected.pitches_um
     ):
         return "returns other wavelengths or another distance of the samples"
+    if not np.allclose(found.middle_offset, expected.middle_offset, atol=1e-6):
+        return "returns another position of the image point; check centre"
     if found.samples != expected.samples:
         return f"returns samples={found.samples!r}, expected {expected.samples!r}"
     read, stored = found.relative_illumination, expected.relative_illumination

@@ -430,6 +430,74 @@ def test_fits_in_degrees_requires_pitch(tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("keywords", "pitch_deg", "zero"),
+    [
+        ({"PIXSCALE": 36.0}, 0.01, None),
+        ({"PIXELSCL": 36.0}, 0.01, None),
+        ({"SECPIX1": 36.0, "SECPIX2": 36.0}, 0.01, None),
+        ({"CUNIT1": "arcsec", "CUNIT2": "arcsec", "CDELT1": 36.0, "CDELT2": 36.0, "CRPIX1": 2.0, "CRPIX2": 2.0}, 0.01, 1.0),
+        ({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CDELT1": -0.01, "CDELT2": 0.01, "CRVAL1": 50.0, "CRPIX1": 3.0,
+          "CRPIX2": 3.0}, 0.01, 2.0),
+        ({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CD1_1": 0.01, "CD2_2": 0.01, "PIXSCALE": 36.0}, 0.01, -1.0),
+    ],
+)  # fmt: skip
+def test_fits_in_angles_uses_the_focal_length(tmp_path, keywords, pitch_deg, zero):
+    options = {"wavelength_nm": 550.0, "unit": "w_m2"}
+    data = np.arange(12.0).reshape(3, 4)
+    fits.writeto(tmp_path / "map.fits", data, fits.Header(keywords))
+    read = read_power_map(tmp_path / "map.fits", focal_length_mm=100.0, **options)
+
+    pitch_um = 1e5 * np.radians(pitch_deg)
+    assert read.grid.pitch_um == pytest.approx(pitch_um)
+    expected = (-2.0 * pitch_um, -1.5 * pitch_um) if zero is None else 2 * (-(zero + 0.5) * pitch_um,)
+    np.testing.assert_allclose(read.grid.origin_um, expected, rtol=1e-9)
+    np.testing.assert_array_equal(read.data[0], data)
+    assert_rejected(
+        tmp_path / "map.fits", r"has cells of 36 arcsec, an angle; pass focal_length_mm=\.\.\., or", **options
+    )
+    assert read_power_map(tmp_path / "map.fits", pitch_um=2.0, **options).grid.pitch_um == 2.0
+    fits.writeto(tmp_path / "map.fits", data, fits.Header({"XPIXSZ": 2.0}), overwrite=True)
+    with pytest.raises(ParameterError, match="'focal_length_mm' must be omitted for a map without cells in angles"):
+        read_power_map(tmp_path / "map.fits", focal_length_mm=100.0, **options)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "match"),
+    [
+        ({"CTYPE1": "RA---TAN-SIP", "CTYPE2": "DEC--TAN-SIP", "A_ORDER": 2}, "has distorted coordinates, A_ORDER = 2"),
+        ({"CTYPE1": "RA---SIN", "CTYPE2": "DEC--SIN"}, "has the coordinates CTYPE1 = 'RA---SIN', which are not linear"),
+        ({"CTYPE2": "Y-LOG", "CUNIT2": "um"}, "has the coordinates CTYPE2 = 'Y-LOG', which are not linear"),
+        ({"CDELT1": 1.0, "CROTA1": 90.0}, "has rotated coordinate axes, CROTA1"),
+        ({"PV2_1": 0.3, "XPIXSZ": 2.0}, "has distorted coordinates, PV2_1 = 0.3"),
+        (
+            {"CUNIT1": "arcsec", "CUNIT2": "arcsec", "CDELT1": 2.0, "CDELT2": 2.0, "PIXSCALE": 1.0},
+            "has pixels of 0.000555556 degrees by CDELT or CD, and of 0.000277778 degrees by other keywords",
+        ),
+    ],
+)
+def test_fits_keywords_that_move_cells_are_reported(tmp_path, keywords, match):
+    fits.writeto(tmp_path / "map.fits", np.ones((3, 4)), fits.Header(keywords))
+    assert_rejected(tmp_path / "map.fits", match, wavelength_nm=550.0, unit="w_m2")
+
+
+def test_scaled_fits_map_is_read(tmp_path):
+    hdu = fits.PrimaryHDU(np.arange(12.0).reshape(3, 4))
+    hdu.scale("int16", bscale=0.5, bzero=3.0)
+    hdu.header["XPIXSZ"], hdu.header["BUNIT"] = 2.0, "W m-2"
+    hdu.writeto(tmp_path / "map.fits")
+    np.testing.assert_allclose(
+        read_power_map(tmp_path / "map.fits", wavelength_nm=550.0).data[0], np.arange(12.0).reshape(3, 4), atol=0.26
+    )
+
+
+def test_unknown_attributes_of_maps_are_reported():
+    array = to_xarray(random_map())
+    array.attrs["gain_e_dn"] = 2.0
+    with pytest.raises(ParameterError, match="has the attribute 'gain_e_dn', which may change the values"):
+        from_xarray(array)
+
+
 def test_read_rejects_rotated_fits_image(tmp_path):
     fits.writeto(tmp_path / "map.fits", np.ones((3, 4)), fits.Header({"CD1_1": 0.1, "CD1_2": 0.1, "CD2_2": 0.1}))
 

@@ -175,7 +175,7 @@ def test_tilt_does_not_change_the_strehl_ratio():
 
 
 @pytest.mark.parametrize("j", [5, 6, 8, 11])
-def test_strehl_ratio_is_that_of_the_highest_peak(j):
+def test_strehl_ratio_is_of_highest_peak(j):
     optics = aberrated(coefficients={j: 0.4, 4: 0.1}, unit="waves")
     dense = optics.psf(WAVELENGTH_NM, pitch_um=LAMBDA_N_UM / 24, n_points=241).psf_per_um2.max()
     assert optics.strehl(WAVELENGTH_NM) == pytest.approx(dense * LAMBDA_N_UM**2 * 4 / np.pi, rel=4e-3)

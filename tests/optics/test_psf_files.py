@@ -175,7 +175,7 @@ def write_fits(path, *images):
 POPPY = {"PIXELSCL": 0.5, "WAVELEN": 550e-9}
 
 
-def test_fits_of_poppy_is_centred_in_its_array(tmp_path):
+def test_fits_of_poppy_is_centred(tmp_path):
     path = write_fits(tmp_path / "psf.fits", (spot(32, 32, 15.5, 15.5), POPPY, ""))
     found = read_psfs(path, focal_length_mm=500.0)
 

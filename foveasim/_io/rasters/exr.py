@@ -73,7 +73,7 @@ def read_header(path: Path) -> ExrHeader:
 
 
 def _check_attributes(header: dict[str, Any]) -> None:
-    """Raise a FormatError for an attribute that changes the values or the pixels, and is not known."""
+    """Raise a FormatError for an unknown attribute that changes the values or pixels."""
     for name in map(str, header):
         if name not in NOT_RELEVANT and RELEVANT.search(name):
             raise FormatError(f"has the attribute {name!r:.60}, which may change the values; apply it, and remove it")

@@ -1,5 +1,5 @@
 """
-FITS files, opened with astropy: size limits of images, without compressed parts, and uniform coordinates of their axes.
+FITS files, opened with astropy: images with size limits, and coordinates of their axes.
 
 Coordinates follow the FITS standard 4.0, section 8. Understood: ``CTYPE``, ``CRPIX`` (0 if missing), ``CRVAL``, ``CDELT`` (1
 if only the unit is given), diagonal ``CD`` and ``PC``, and ``CUNIT``, a length or an angle; tangential celestial coordinates,
@@ -66,16 +66,28 @@ class ImageAxes:
     """
     Uniform coordinates of the columns and rows of an image.
 
-    ``pitch`` (x, y): positive, in µm or degrees. ``zero`` (x, y): position of the coordinate 0 in samples, from 0 in the middle
-    of the first one; None if unknown. ``is_celestial``: whether the coordinates are those of the sky, whose directions are
-    independent of those of the picture.
+    ``pitch_um`` or ``pitch_deg`` (x, y): positive; the other one is None. ``zero_px`` (x, y): position of the coordinate 0 in
+    samples, from 0 in the middle of the first one; None if unknown. ``is_celestial``: whether the coordinates are those of the
+    sky, whose directions are independent of those of the picture.
     """
 
-    pitch: tuple[float, float]
-    is_angle: bool
+    pitch_um: tuple[float, float] | None = None
+    pitch_deg: tuple[float, float] | None = None
     is_descending: tuple[bool, bool] = (False, False)
-    zero: tuple[float, float] | None = None
+    zero_px: tuple[float, float] | None = None
     is_celestial: bool = False
+
+    @property
+    def unit(self) -> str:
+        """Name of the unit of the pitch."""
+        return "µm" if self.pitch_deg is None else "degrees"
+
+    @property
+    def steps(self) -> tuple[float, float]:
+        """Pitch (x, y) in the unit."""
+        found = self.pitch_um if self.pitch_deg is None else self.pitch_deg
+        assert found is not None
+        return found
 
 
 def images_of(file: Any) -> list[tuple[int, Any]]:
@@ -95,7 +107,7 @@ def images_of(file: Any) -> list[tuple[int, Any]]:
 
 def select_image(file: Any, name: str | None, what: str) -> Any:
     """
-    Return the header-data unit of the image with a name or number, or of the only image.
+    Return the unit of the image with a name or number, or of the only image.
 
     ``what``: kind of the image, for messages. Raises FormatError if there is none, or several without a name.
     """
@@ -120,7 +132,7 @@ def names_of(images: list[tuple[int, Any]]) -> list[str]:
 
 def image_axes(header: Any) -> ImageAxes | None:
     """
-    Return the coordinates of the axes 1 and 2; None if the header contains none in a unit.
+    Return the coordinates of the axes 1 and 2; None without a unit.
 
     Raises FormatError if the coordinates are rotated, distorted or not linear, or two keywords contradict each other.
     """
@@ -129,11 +141,11 @@ def image_axes(header: Any) -> ImageAxes | None:
             raise FormatError(f"has distorted coordinates, {keyword} = {header[keyword]!r:.20}; resample it")
     of_wcs = _world_axes(header)
     scale = _pixel_scale(header)
-    if of_wcs is None or scale is None or of_wcs.is_angle != scale.is_angle:
+    if of_wcs is None or scale is None or of_wcs.unit != scale.unit:
         return of_wcs or scale
-    for along, other in zip(of_wcs.pitch, scale.pitch, strict=True):
+    for along, other in zip(of_wcs.steps, scale.steps, strict=True):
         if abs(along - other) > SAME_SCALE * other:
-            unit = "degrees" if scale.is_angle else "µm"
+            unit = scale.unit
             raise FormatError(
                 f"has pixels of {along:.6g} {unit} by CDELT or CD, and of {other:.6g} {unit} by other keywords"
             )
@@ -167,11 +179,11 @@ def _world_axes(header: Any) -> ImageAxes | None:
         # Celestial coordinates are those of a plane that touches the sphere at the reference pixel.
         start = 0.0 if is_celestial else number_of(header, f"CRVAL{axis}", 0)
         zero.append(number_of(header, f"CRPIX{axis}", 0) - 1.0 - start / step)
+    pitch = {"pitch_deg" if is_angle else "pitch_um": (abs(step_x), abs(step_y))}
     return ImageAxes(
-        pitch=(abs(step_x), abs(step_y)),
-        is_angle=is_angle,
+        **pitch,
         is_descending=(False, False) if is_celestial else (step_x < 0.0, step_y < 0.0),
-        zero=(zero[0], zero[1]),
+        zero_px=(zero[0], zero[1]),
         is_celestial=is_celestial,
     )
 
@@ -194,7 +206,8 @@ def _pixel_scale(header: Any) -> ImageAxes | None:
             size = length_um
         else:
             size = 1.0
-        return ImageAxes(pitch=(found[0] * size, found[1] * size), is_angle=is_angle and unit in DEGREES)
+        both = found[0] * size, found[1] * size
+        return ImageAxes(pitch_deg=both) if is_angle and unit in DEGREES else ImageAxes(pitch_um=both)
     return None
 
 

@@ -42,9 +42,10 @@ RELEVANT = re.compile(
 
 def with_attributes(array: xr.DataArray) -> xr.DataArray:
     """
-    Return an array whose values are those that its attributes describe, NaN outside of the valid range.
+    Return an array with the values that its attributes describe.
 
-    Raises FormatError for an attribute that may change the values and is not known, or a range that is not numbers.
+    Values outside of the valid range are NaN. Raises FormatError for an attribute that may change the values and is not known,
+    or a range that is not numbers.
     """
     for name in map(str, array.attrs):
         if name.lower() not in UNDERSTOOD | IRRELEVANT and RELEVANT.search(name):

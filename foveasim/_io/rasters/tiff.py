@@ -32,7 +32,11 @@ GDAL_FACTOR = re.compile(r'role="(scale|offset)"[^>]*>\s*([^<\s]+)', re.IGNORECA
 
 
 def check_page(page: Any) -> bool:
-    """Return whether the first row of a page is the top row; raise a FormatError for tags that change its numbers."""
+    """
+    Return whether the first row of a page is the top row.
+
+    Raises FormatError for tags that change its numbers.
+    """
     import tifffile
 
     if page.photometric not in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB):

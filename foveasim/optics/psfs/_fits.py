@@ -1,5 +1,5 @@
 """
-PSFs in FITS files: stacks of foveasim, and images of POPPY, STPSF (WebbPSF) and other programs.
+PSFs in FITS files: stacks of foveasim, images of POPPY, STPSF and other programs.
 
 A stack is the primary image ``psf``, (n_point, n_wavelength, n_y, n_x), with the keyword ``PITCH_UM`` and, where they differ
 from the defaults of :meth:`foveasim.optics.PSFGrid.from_arrays`, ``IMAGE``, ``FIRSTROW``, ``SAMPLES`` and the position of the
@@ -163,16 +163,17 @@ def _pitch_um(header: Any, focal_length_mm: float | None) -> tuple[float, ImageA
         raise FormatError(
             "does not specify the pitch of its samples: it has no CDELT with a unit, PIXELSCL, PIXSCALE, XPIXSZ or PITCH_UM"
         )
-    along_x, along_y = axes.pitch
+    along_x, along_y = axes.steps
+    is_angle = axes.pitch_deg is not None
     if abs(along_x - along_y) > SAME_STEP * along_x:
         raise FormatError(f"has samples of {along_x:g} x {along_y:g}, expected squares; resample it")
     if any(axes.is_descending):
         raise FormatError("has coordinates that fall along an axis, CDELT < 0; write it with ascending ones")
-    if not axes.is_angle and focal_length_mm is not None:
+    if not is_angle and focal_length_mm is not None:
         raise ParameterError(
             "focal_length_mm", "must be omitted for a file with samples in a unit of length", focal_length_mm
         )
-    if axes.is_angle and focal_length_mm is None:
+    if is_angle and focal_length_mm is None:
         raise FormatError(f"has samples of {3600.0 * along_x:.6g} arcsec, an angle; pass focal_length_mm=...")
     pitch_um = along_x if focal_length_mm is None else math.radians(along_x) * 1e3 * focal_length_mm
     return pitch_um, axes
@@ -182,7 +183,7 @@ def _zero(axes: ImageAxes) -> Any:
     """Return the position (row, column) of the coordinate 0, or the middle of the array."""
     if axes.is_celestial:
         raise FormatError("has celestial coordinates, which do not say where the image point is; pass centre=...")
-    return "middle" if axes.zero is None else axes.zero[::-1]
+    return "middle" if axes.zero_px is None else axes.zero_px[::-1]
 
 
 def _planes(hdu: Any, path: Path) -> NDArray[Any]:

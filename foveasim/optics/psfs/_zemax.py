@@ -67,7 +67,11 @@ INDEX_KEYS = ("psfs", "image", "first_row", "samples", "centre")
 
 
 class Listing(NamedTuple):
-    """PSF of one point, values (n_y, n_x), of a range of wavelengths; centre (row, column) or None."""
+    """
+    PSF of one point and a range of wavelengths.
+
+    ``values`` (n_y, n_x); ``centre`` (row, column) or None.
+    """
 
     values: Floats
     range_nm: tuple[float, float]
@@ -111,7 +115,7 @@ def read_listing(path: Path) -> Listing:
 
 
 def _header(lines: list[str]) -> dict[str, re.Match[str]]:
-    """Return the known lines by name; raise a FormatError that contains a line that is not known."""
+    """Return the known lines by name; raise a FormatError with a line that is not."""
     patterns = {"'Data spacing is'": SPACING, "'Image grid size'": SIZE, "centre": CENTRE, "wavelength": WAVES}
     found: dict[str, re.Match[str]] = {}
     for line in lines:
@@ -279,7 +283,7 @@ def _index_centre(given: Any) -> Any:
 def _listed(
     index: Path, entry: dict[str, Any], file: Path, reference: tuple[str, Listing] | None, centre: Any
 ) -> Listing:
-    """Read the listing of an entry, which must be as the first one, and the first one of its wavelength."""
+    """Read the listing of an entry, which must be as the first one of its wavelength."""
     with as_file_error(file, "listing of a PSF", passes=(FileError,)):
         one = read_listing(file)
         _wavelength_nm(one, entry["wavelength_nm"], "", f"{index.name} lists it for")

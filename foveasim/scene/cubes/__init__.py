@@ -9,6 +9,7 @@ extension       format                            metadata in the file
 .exr            spectral EXR                      wavelengths, unit, radiance or reflectance
 .nc             netCDF, HDF5                      wavelengths, unit, pixel pitch
 .zarr           zarr directory                    wavelengths, unit, pixel pitch
+folder          grey pictures, one per band       wavelengths in their names
 .npy            numpy array (row, column, band)   none
 .tif            TIFF of several bands             none
 ==============  ================================  =================================================================

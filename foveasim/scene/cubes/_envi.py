@@ -148,7 +148,7 @@ def _entries(path: Path) -> dict[str, str]:
 
 
 def _check_keys(entries: dict[str, str]) -> None:
-    """Raise a FormatError for a key that changes the values and is not known, or a file of another type."""
+    """Raise a FormatError for an unknown key that changes values, or another file type."""
     for key in entries:
         if key not in UNDERSTOOD and key not in IRRELEVANT and RELEVANT.search(key):
             raise FormatError(f"has the unknown key {key!r:.60}, which may change the values; remove it if it does not")

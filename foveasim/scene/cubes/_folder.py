@@ -1,5 +1,5 @@
 """
-Cubes in a folder of pictures: one grey picture per band, as CAVE and other databases store them.
+Cubes in a folder of pictures: one grey picture per band, as in the database CAVE.
 
 The pictures are PNG or TIFF files with one number per pixel, 8 or 16 bits or floating point, all of one size, top row first.
 They are sorted by their names, numbers by value. Wavelengths are numbers before ``nm`` in the names, ``spool_450nm.png``, or

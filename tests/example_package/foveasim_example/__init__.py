@@ -176,14 +176,14 @@ CUBE_FORMATS.register("lines", lines, example=example_lines)
 def read_spot(path: Path) -> PSFGrid:
     """Read a PSF of samples of 1 µm at 550 nm, lowest row first, after a header line."""
     values = np.loadtxt(path, skiprows=1, ndmin=2)
-    return PSFGrid.from_arrays(values, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0)
+    return PSFGrid.from_arrays(values, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0, centre="middle")
 
 
 def example_spot(path: Path) -> PSFGrid:
     """Write a PSF without symmetry."""
     values = np.pad([[1.0, 2.0], [4.0, 8.0]], 2)
     path.write_text("SPOT\n" + "\n".join(" ".join(map(str, row)) for row in values), encoding="utf-8")
-    return PSFGrid.from_arrays(values, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0)
+    return PSFGrid.from_arrays(values, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0, centre="middle")
 
 
 spot = FileFormat(title="spot", suffixes=(".spot",), signatures=(b"SPOT",), read=read_spot)
