@@ -91,7 +91,7 @@ class ImageAxes:
 
 
 def images_of(file: Any) -> list[tuple[int, Any]]:
-    """Return the numbers and header-data units of the images; raise a FormatError for compressed ones."""
+    """Return numbers and units of the images; raise a FormatError for compressed ones."""
     found = []
     for number in range(MAX_HDUS):
         try:
