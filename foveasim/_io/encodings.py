@@ -11,13 +11,15 @@ from foveasim.units import decode_srgb, encode_srgb
 
 #: sRGB (photographs), the square root of the radiance (the paper), linear radiance.
 Encoding = Literal["srgb", "sqrt", "linear"]
+#: What a caller may order: the encoding that the file states or its format defines, or one of these instead.
+FileEncoding = Literal["auto", "srgb", "sqrt", "linear"]
 
 
 def decode(values: Floats, encoding: Encoding) -> Floats:
     """
     Decode values >= 0 to relative radiance.
 
-    sRGB as in IEC 61966-2-1, extrapolated above 1.
+    sRGB as in IEC 61966-2-1, extrapolated above 1. Linear values may be negative.
     """
     if encoding == "sqrt":
         return values * values

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.calls import POSITIVE
-from foveasim._io.images import read_picture
+from foveasim._io.images import EncodedPicture, as_encoded
 from foveasim.camera import Camera
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
@@ -83,7 +83,7 @@ def photograph_scenes(
     optics : Optics, optional
         By default a lens of 8 mm and f/2.8.
     pictures : sequence of paths, or mapping of str to arrays, optional
-        Photographs, sRGB-encoded; by default five of scikit-image.
+        Photographs, in the colours that files state; arrays sRGB-encoded. By default five of scikit-image.
     distance_m, peak_radiance_w_m2_sr_nm, wavelength_nm, band_width_nm
         As for :meth:`Scene.from_picture`.
 
@@ -113,22 +113,22 @@ def photograph_scenes(
         directory = files("skimage.data")
         pictures = [Path(str(directory / name)) for name in DEFAULT_PICTURES]
     if isinstance(pictures, Mapping):
-        arrays = {str(name): np.asarray(picture) for name, picture in pictures.items()}
+        photographs = {str(name): as_encoded(picture) for name, picture in pictures.items()}
     else:
-        arrays = {}
+        photographs = {}
         for path in pictures:
             name = Path(path).stem
-            if name in arrays:
+            if name in photographs:
                 raise ParameterError("pictures", "must have unique file names", name)
-            arrays[name] = read_picture(path)
-    if not arrays:
+            photographs[name] = as_encoded(path)
+    if not photographs:
         raise ParameterError("pictures", "must contain at least one picture")
     scenes = {}
-    for name, array in arrays.items():
-        square = _central_square(array)
+    for name, photograph in photographs.items():
+        square: Any = _central_square(photograph)
         scenes[name] = Scene.from_picture(
             square,
-            pitch_um=FIELD_MARGIN * width_um / (optics.magnification(distance_m) * square.shape[0]),
+            pitch_um=FIELD_MARGIN * width_um / (optics.magnification(distance_m) * square.pixels.shape[0]),
             distance_m=distance_m,
             peak_radiance_w_m2_sr_nm=peak_radiance_w_m2_sr_nm,
             wavelength_nm=wavelength_nm,
@@ -148,9 +148,9 @@ def cameras_of(
     }
 
 
-def _central_square(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _central_square(picture: EncodedPicture) -> EncodedPicture:
     """Return the largest square around the centre of a picture."""
-    n_y, n_x = picture.shape[:2]
+    n_y, n_x = picture.pixels.shape[:2]
     n = min(n_y, n_x)
     y, x = (n_y - n) // 2, (n_x - n) // 2
-    return picture[y : y + n, x : x + n]
+    return picture.crop(slice(y, y + n), slice(x, x + n))

@@ -238,8 +238,9 @@ class Picture:
             ``.tif`` with integers or floating-point numbers, or, with the extra ``pictures``, ``.exr``. 16 bits per channel
             are available in ``.png`` (in colour with the extra ``pictures``) and ``.tif``.
         white, encode_srgb
-            For integers, as for :meth:`to_image`: encoded in sRGB by default. Floating-point files contain linear values and
-            cannot be encoded: ``data``, or, with ``white``, light as of :meth:`to_rgb`.
+            For integers, as for :meth:`to_image`: encoded in sRGB by default; linear ones are marked so, in ``.png`` and
+            ``.tif`` only. Floating-point files contain linear values and cannot be encoded: ``data``, or, with ``white``, light
+            as of :meth:`to_rgb`. :meth:`foveasim.Scene.from_picture` returns these values from each file.
         bits : {8, 16, 32}, optional
             32 writes floating-point numbers, with NaN where no photosite lies and without alpha. By default 32 for TIFF and
             EXR, and 8 for other formats.
@@ -252,8 +253,8 @@ class Picture:
         FileError
             When the extension is unknown, the format does not support ``bits``, or the file cannot be written.
         ParameterError
-            When ``bits`` is none of these, a floating-point file has a background and no ``white``, or as for
-            :meth:`to_image`.
+            When ``bits`` is none of these, a floating-point file has a background and no ``white``, integers are linear in a
+            format that cannot say so, or as for :meth:`to_image`.
         """
         chosen = picture_format(path)
         if bits is None and np.dtype(chosen.types[0]).itemsize == 4:
@@ -262,7 +263,15 @@ class Picture:
             if background is None and not chosen.has_alpha:
                 background = NO_DATA_COLOUR
             encode_srgb = encode_srgb is None or encode_srgb
-            write_picture(path, self.to_image(white, encode_srgb=encode_srgb, bits=bits or 8, background=background))
+            if not encode_srgb and chosen.write_linear is None:
+                hint = "use .png or .tif"
+                raise ParameterError(
+                    "encode_srgb",
+                    f"must be True for {chosen.title}, which cannot store that values are linear",
+                    hint=hint,
+                )
+            image = self.to_image(white, encode_srgb=encode_srgb, bits=bits or 8, background=background)
+            write_picture(path, image, encoding="srgb" if encode_srgb else "linear")
             return
         if encode_srgb:
             raise ParameterError("encode_srgb", "must be False for floating-point files, which store linear values")

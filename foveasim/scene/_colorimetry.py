@@ -7,30 +7,13 @@ from functools import cache
 import numpy as np
 
 from foveasim._core.validation import Floats, read_only
+from foveasim._io.primaries import WHITE_XYZ, XYZ_OF_SRGB, srgb_of_xyz
 from foveasim.scene._illuminants import illuminant, read_table
 
-#: Chromaticities (x, y) of red, green, blue and white of sRGB (IEC 61966-2-1).
-SRGB_XY = np.array([[0.64, 0.33], [0.30, 0.60], [0.15, 0.06], [0.3127, 0.3290]])
-#: Sharpened cone responses of XYZ (Lam 1985, Bradford).
-BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 #: End of the linear part of CIELAB, and its slope: CIE 15:2004, section 8.2.1.
 LAB_LINEAR_END, LAB_SLOPE = (24.0 / 116.0) ** 3, 841.0 / 108.0
 
 
-def _xyz_of_xy(xy: Floats) -> Floats:
-    """Return tristimulus values (n, 3) of chromaticities (n, 2), with Y = 1."""
-    return np.column_stack((xy[:, 0], xy[:, 1], 1.0 - xy.sum(axis=1))) / xy[:, 1:]
-
-
-def _srgb_primaries() -> Floats:
-    """Return the tristimulus values (3, 3) of linear red, green and blue, whose sum is white."""
-    xyz = _xyz_of_xy(SRGB_XY)
-    return np.asarray(np.linalg.solve(xyz[:3].T, xyz[3])[:, np.newaxis] * xyz[:3])
-
-
-#: Tristimulus values of linear red, green and blue, one primary per row, and of white.
-XYZ_OF_SRGB = _srgb_primaries()
-WHITE_XYZ = XYZ_OF_SRGB.sum(axis=0)
 #: Luminance of linear red, green and blue, rounded as in Rec. ITU-R BT.709.
 LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
@@ -45,16 +28,6 @@ def tristimulus(spectra: Floats, wavelength_nm: Floats, band_width_nm: Floats) -
     at_nm, *observer = read_table("cie_observer")
     matching = [np.interp(wavelength_nm, at_nm, column, left=0.0, right=0.0) for column in observer]
     return np.asarray((spectra * band_width_nm) @ np.transpose(matching))
-
-
-def srgb_of(xyz: Floats, white_xyz: Floats) -> Floats:
-    """
-    Return linear sRGB (n, 3) of tristimulus values (n, 3).
-
-    Chromatic adaptation to D65 by the linear Bradford transform: white (3,) becomes (1, 1, 1).
-    """
-    cones = xyz @ BRADFORD.T / (BRADFORD @ white_xyz) * (BRADFORD @ WHITE_XYZ)
-    return np.asarray(np.linalg.solve(XYZ_OF_SRGB.T, np.linalg.solve(BRADFORD, cones.T)).T)
 
 
 def lab_of(srgb: Floats) -> Floats:
@@ -82,7 +55,7 @@ def patch_colours(illumination: Floats, wavelength_nm: Floats, band_width_nm: Fl
         tristimulus(illumination * part, wavelength_nm, band_width_nm)
         for part in (reflectances(wavelength_nm), np.ones((1, wavelength_nm.size)))
     )
-    return srgb_of(patches, white[0]) if white.min() > 0.0 else None
+    return srgb_of_xyz(patches, white[0]) if white.min() > 0.0 else None
 
 
 @cache

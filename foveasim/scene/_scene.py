@@ -6,12 +6,12 @@ import copy
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from foveasim._core.calls import Limits, OwnCheck, check_declared
 from foveasim._core.show import ViewMethod, view_method
@@ -31,9 +31,9 @@ from foveasim._core.validation import (
     unmasked,
     wavelengths_nm,
 )
-from foveasim._io.encodings import Encoding, decode
+from foveasim._io.encodings import FileEncoding, decode
 from foveasim._io.formats import as_file_error
-from foveasim._io.images import as_pixels, write_picture
+from foveasim._io.images import EncodedPicture, as_encoded, write_picture
 from foveasim._io.mapped_files import check_unchanged, value_range
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.fields import from_file_rows
@@ -342,7 +342,7 @@ class Scene:
         wavelength_nm: Sequence[float] | None = None,
         band_width_nm: float | Sequence[float] | None = None,
         spectrum: Sequence[Sequence[float]] | Floats | None = None,
-        encoding: Encoding = "srgb",
+        encoding: FileEncoding = "auto",
         channels: Literal["rgb", "bgr"] = "rgb",
     ) -> Scene:
         """
@@ -382,8 +382,10 @@ class Scene:
             except that of a grey picture without ``wavelength_nm``, whose band is 100 nm wide.
         spectrum : (n_channel, n_wavelength), optional
             Relative spectrum of each channel at the value 1.
-        encoding : {"srgb", "sqrt", "linear"}
-            Encoding of the values: sRGB (photographs), square root of the radiance (the paper), or radiance.
+        encoding : {"auto", "srgb", "sqrt", "linear"}
+            Encoding of the values: sRGB (photographs), square root of the radiance (the paper), or radiance. ``"auto"`` is
+            what a file or an image of Pillow states, else linear for EXR, Radiance HDR, PFM and floating-point TIFF, and sRGB
+            for other files and arrays. Every other encoding replaces what the file states, such as its profile: see the notes.
         channels : {"rgb", "bgr"}
             Order of the channels of a colour array: ``"bgr"`` for those of OpenCV.
 
@@ -400,6 +402,12 @@ class Scene:
         Photometric quantities are the sum of the spectral radiance over the bands, weighted by their widths and by the
         photopic luminous efficiency V(λ) (:func:`foveasim.scene.charts.photopic`), times 683 lm/W. Full daylight is about
         20,000 to 100,000 lx, an overcast sky 1,000 to 10,000, an office 500, and the full moon 0.3.
+
+        With ``encoding="auto"``, colours in other spaces become linear sRGB, and the white of each space becomes white: ICC
+        profiles (with littleCMS, relative colorimetric, extra ``pictures``), gamma and primaries of PNG, TIFF, BMP, EXR and
+        Radiance HDR, the codes of Rec. ITU-T H.273 in PNG, HEIC, AVIF and JPEG 2000, Adobe RGB of cameras. Values of Radiance
+        HDR are divided by their EXPOSURE and COLORCORR. Colours outside sRGB are negative in a channel; their luminance is kept
+        for one wavelength, and such a channel is 0 in a scene of several, since radiance is not negative.
         """
         _check_framing(pitch_um, fit, field_of_view_deg)
         if pitch_um is None and field_of_view_deg is None and fit is None:
@@ -408,7 +416,8 @@ class Scene:
         if peak is not None:
             peak = RADIANCE.check("peak_radiance_w_m2_sr_nm", peak)
         is_file = isinstance(picture, str | os.PathLike)
-        pixels = as_pixels(picture)
+        read = as_encoded(picture, encoding)
+        pixels = read.pixels
         if (
             pixels.ndim not in (2, 3)
             or 0 in pixels.shape
@@ -420,12 +429,12 @@ class Scene:
         has_alpha = (
             pixels.ndim == 3 and pixels.shape[2] in (2, 4) and (spectrum is None or len(spectrum) != pixels.shape[2])
         )
-        if channels == "bgr" and not isinstance(picture, np.ndarray):
+        if channels == "bgr" and not read.is_array:
             raise ParameterError("channels", "must be 'rgb' for files and images of Pillow", channels)
         if channels == "bgr" and pixels.ndim == 3 and pixels.shape[2] in (3, 4):
             pixels = pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
         try:
-            colours = _relative_radiance(pixels, encoding, has_alpha=has_alpha)
+            colours = _relative_radiance(replace(read, pixels=pixels), has_alpha=has_alpha)
         except ParameterError as error:
             raise (FileError(str(picture), str(error)) if is_file else error) from None
         n_channels = colours.shape[0]
@@ -444,6 +453,7 @@ class Scene:
         elif n_channels == 1:
             relative = np.ones((1, waves_nm.size))
         elif n_channels == 3 and waves_nm.size == 1:
+            # Before colours outside sRGB are clipped: their luminance is that of the photograph.
             colours, relative = np.tensordot(LUMINANCE_WEIGHTS, colours, axes=1)[np.newaxis], np.ones((1, 1))
         else:
             raise ParameterError(
@@ -463,6 +473,8 @@ class Scene:
             illuminance_lux=illuminance_lux,
             reflectance=reflectance,
         )
+        if read.is_wide:
+            np.maximum(colours, 0.0, out=colours)
         return cls(
             freeze(colours),
             peak * relative,
@@ -768,8 +780,9 @@ def _framing_conflict(name: str, value: object, other: str) -> ParameterError:
     )
 
 
-def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Images:
-    """Return the relative radiance (n_channel, n_y, n_x) float32, multiplied by alpha."""
+def _relative_radiance(picture: EncodedPicture, *, has_alpha: bool) -> Images:
+    """Return the relative radiance (n_channel, n_y, n_x) float32, multiplied by alpha; negative outside sRGB."""
+    pixels, encoding = picture.pixels, picture.encoding
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.bool_:
         pixels = pixels.astype(np.uint8) * np.uint8(255)
@@ -784,7 +797,10 @@ def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: b
         _kernels.look_up(colours, table, radiance)
         alpha = values[from_file_rows(pixels[..., -1])] if has_alpha else None
     elif pixels.dtype.kind == "f":
-        if not np.isfinite(pixels).all() or pixels.min() < 0:
+        colours = pixels[..., :-1] if has_alpha else pixels
+        may_be_negative = picture.is_wide and encoding == "linear"
+        lowest = (pixels[..., -1:] if has_alpha else pixels[..., :0]) if may_be_negative else pixels
+        if not np.isfinite(pixels).all() or lowest.min(initial=0.0) < 0:
             raise ParameterError("picture", "must be finite and >= 0 in all pixels")
         if encoding != "linear" and pixels.max() > MAX_ENCODED:
             raise ParameterError(
@@ -793,9 +809,9 @@ def _relative_radiance(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: b
                 float(pixels.max()),
                 hint="the peak of floating-point pictures is 1: divide by 255, or pass uint8",
             )
-        colours = pixels[..., :-1] if has_alpha else pixels
         precise = colours.astype(np.float32) if pixels.dtype == np.float16 else colours
-        radiance = decode(np.ascontiguousarray(from_file_rows(precise)), encoding).astype(np.float32)
+        decoded = decode(np.ascontiguousarray(from_file_rows(precise)), encoding)
+        radiance = decoded.astype(np.float32, copy=np.may_share_memory(decoded, pixels))
         alpha = from_file_rows(pixels[..., -1]).astype(np.float32) if has_alpha else None
     else:
         raise ParameterError("picture", f"must have the dtype uint8, uint16 or float, got {pixels.dtype}")

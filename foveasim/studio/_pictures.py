@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._io.encodings import Encoding, decode, encode
-from foveasim._io.images import read_picture, write_picture
+from foveasim._io.encodings import FileEncoding, decode, encode
+from foveasim._io.images import EncodedPicture, as_encoded, write_picture
 from foveasim.config import Shot
 
 #: Pixels of a reduced picture per side of the smallest photosite, and per λN.
@@ -39,9 +39,9 @@ class ReducedPictures:
     def __init__(self, new_path: Callable[[str], Path]) -> None:
         self._new_path = new_path
         self._notes: dict[str, str] = {}
-        self._found: dict[tuple[str, int, Encoding], tuple[Path, str] | None] = {}
+        self._found: dict[tuple[str, int, FileEncoding], tuple[Path, str] | None] = {}
 
-    def path_of(self, path: str, shot: Shot, encoding: Encoding) -> str:
+    def path_of(self, path: str, shot: Shot, encoding: FileEncoding) -> str:
         """Return the path of a picture, or of a reduced one if a shot cannot resolve its pixels."""
         key = (path, resolved_pixels(shot), encoding)
         if key not in self._found:
@@ -59,25 +59,26 @@ class ReducedPictures:
 
 
 def reduced_picture(
-    path: Path, new_path: Callable[[str], Path], n_pixels: int, encoding: Encoding
+    path: Path, new_path: Callable[[str], Path], n_pixels: int, encoding: FileEncoding
 ) -> tuple[Path, str] | None:
     """
     Write a picture with means of blocks of pixels, unless it is small.
 
-    The means are those of the relative radiance.
+    The means are those of the relative radiance; with the same ``encoding`` the file is read as the picture.
 
     ``new_path``: returns an unused path for a name. ``n_pixels``: the shorter side of the result is not smaller. Returns the
     path of the new TIFF file, and a note in one line; None for a picture of less than twice this size. Raises FileError when
     the file is not a picture.
     """
-    pixels = read_picture(path)
-    n_y, n_x = pixels.shape[:2]
+    picture = as_encoded(path, encoding)
+    n_y, n_x = picture.pixels.shape[:2]
     block = min(n_y, n_x) // n_pixels
     if block < 2:
         return None
     target = new_path(f"{path.stem}_{n_x // block}x{n_y // block}.tif")
     try:
-        write_picture(target, _block_means(pixels, block, encoding))
+        is_linear = picture.encoding == "linear"
+        write_picture(target, _block_means(picture, block), encoding="linear" if is_linear else "srgb")
     except BaseException:
         target.unlink(missing_ok=True)
         raise
@@ -87,12 +88,13 @@ def reduced_picture(
     )
 
 
-def _block_means(pixels: NDArray[Any], block: int, encoding: Encoding) -> NDArray[Any]:
+def _block_means(picture: EncodedPicture, block: int) -> NDArray[Any]:
     """
     Return means of square blocks, uint16 or float32.
 
     Incomplete blocks at the right and at the bottom are cropped; the result has no alpha.
     """
+    pixels, encoding = picture.pixels, picture.encoding
     n_y, n_x = (n // block for n in pixels.shape[:2])
     n_channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     n_colours = n_channels - (n_channels in (2, 4))  # without alpha
@@ -106,7 +108,11 @@ def _block_means(pixels: NDArray[Any], block: int, encoding: Encoding) -> NDArra
         alpha = rows[..., -1] / np.float32(peak) if n_colours < n_channels else None
         for channel in range(n_colours):
             values = rows[..., channel]
-            values = decode(np.maximum(values, 0.0).astype(np.float64), encoding) if table is None else table[values]
+            if table is None:
+                values = values if picture.is_wide else np.maximum(values, 0.0)
+                values = decode(values.astype(np.float64), encoding)
+            else:
+                values = table[values]
             values = values if alpha is None else values * alpha
             means[row, :, channel] = values.mean(axis=(0, 2), dtype=np.float64)
     means = encode(means.astype(np.float64), encoding).astype(np.float32)

@@ -433,7 +433,7 @@ class Session:
         if self.result is None:
             return path
         self.check(f"reading {Path(self.files.available(path)).name}")
-        encoding = self.history.settings["scene"].get("encoding", "srgb")
+        encoding = self.history.settings["scene"].get("encoding", "auto")
         return self.pictures.path_of(path, self.result.shot, encoding)
 
     def required_result(self, purpose: str) -> Simulated:

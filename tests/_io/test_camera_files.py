@@ -12,8 +12,7 @@ import tifffile
 from PIL import Image, ImageOps
 
 import foveasim as fs
-from foveasim._io import images
-from foveasim._io.images import ORIENTATION_TAG, picture_names, read_picture
+from foveasim._io.images import ORIENTATION_TAG, _reading, picture_names, read_picture
 from foveasim.errors import FileError
 from foveasim.units import decode_srgb
 
@@ -167,7 +166,7 @@ def test_truncated_file_gives_one_line(tmp_path, capfd, name, encode, fraction):
 def test_missing_library_names_the_extra(tmp_path, monkeypatch, name, module):
     (tmp_path / name).write_bytes(heic(FLAT) if name == "a.heic" else dng(FLAT / 255.0))
     monkeypatch.setitem(sys.modules, module, None)
-    monkeypatch.setattr(images, "read_in_sandbox", lambda reader, path, **_: reader(str(path)))
+    monkeypatch.setattr(_reading, "read_in_sandbox", lambda reader, path, **_: reader(str(path)))
 
     with pytest.raises(FileError, match=rf"needs {module}; install it with: pip install 'foveasim\[pictures\]'"):
         read_picture(tmp_path / name)

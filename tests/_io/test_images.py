@@ -18,8 +18,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from waiting import DEADLINE_S
 
-from foveasim._io import images
-from foveasim._io.images import read_picture, write_picture
+from foveasim._io.images import _limits, _reading, read_picture, write_picture
 from foveasim.errors import FileError
 
 #: A letter without symmetry, top row first, as in files.
@@ -237,7 +236,7 @@ def test_uncompressed_exr_is_read_exactly(tmp_path):
 @pytest.fixture
 def no_sandbox(monkeypatch):
     """Read EXR in this process, because starting a sandbox process takes about a second per file."""
-    monkeypatch.setattr(images, "read_in_sandbox", lambda reader, path, **_: reader(str(path)))
+    monkeypatch.setattr(_reading, "read_in_sandbox", lambda reader, path, **_: reader(str(path)))
 
 
 def saved_exr(path, picture, compression, *, is_tiled=False):
@@ -583,7 +582,7 @@ def test_truncated_picture_below_limit_is_corrupt(tmp_path):
 
 @pytest.mark.parametrize("planes", ["contig", "separate"])
 def test_pixel_limit_applies_to_planar_tiff(tmp_path, monkeypatch, planes):
-    monkeypatch.setattr(images, "MAX_PIXELS", 1000)
+    monkeypatch.setattr(_limits, "MAX_PIXELS", 1000)
     picture = NOISE if planes == "contig" else np.moveaxis(NOISE, -1, 0)
     assert_is_rejected(tmp_path, tiff(picture, photometric="rgb", planarconfig=planes), "more than the limit of 1000$")
 

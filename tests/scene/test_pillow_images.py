@@ -8,7 +8,7 @@ import skimage.data
 from PIL import Image
 
 import foveasim as fs
-from foveasim.errors import ParameterError
+from foveasim.errors import FoveasimError, ParameterError
 
 PHOTOGRAPH = Image.fromarray(skimage.data.astronaut()[:60:2, :80:2])
 LIGHT = {"distance_m": 1.0, "luminance_cd_m2": 100.0}
@@ -28,7 +28,6 @@ def scene_of(picture, **options):
         ("RGB", "png"),
         ("RGBA", "png"),
         ("I;16", "png"),
-        ("CMYK", "jpg"),
     ],
 )
 def test_image_gives_the_scene_of_its_file(tmp_path, mode, extension):
@@ -43,11 +42,24 @@ def test_image_gives_the_scene_of_its_file(tmp_path, mode, extension):
         assert np.array_equal(scene_of(image).basis, expected.basis)
 
 
-@pytest.mark.parametrize("mode", ["CMYK", "HSV", "YCbCr"])
+@pytest.mark.parametrize("mode", ["HSV", "YCbCr"])
 def test_colour_spaces_are_converted(mode):
     image = PHOTOGRAPH.convert(mode)
 
     assert np.array_equal(scene_of(image).basis, scene_of(np.asarray(image.convert("RGB"))).basis)
+
+
+def test_inks_without_profile_need_an_encoding(tmp_path):
+    image = PHOTOGRAPH.convert("CMYK")
+    image.save(tmp_path / "photo.tif")
+    expected = scene_of(np.asarray(image.convert("RGB"))).basis
+
+    for picture in (image, tmp_path / "photo.tif"):
+        assert np.array_equal(scene_of(picture, encoding="srgb").basis, expected)
+        with pytest.raises(
+            FoveasimError, match=r"has CMYK without a colour profile, .*; to read its values without it, "
+        ):
+            scene_of(picture)
 
 
 @pytest.mark.parametrize(("orientation", "turn"), [(1, 0), (3, 2), (6, -1), (8, 1)])

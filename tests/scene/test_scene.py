@@ -369,7 +369,7 @@ def test_from_picture_rejects_invalid_arrays(picture, message):
         ),
         (COLOUR, {"band_width_nm": [10.0, 10.0]}, "'band_width_nm' must be one number, or one for each of the 3"),
         (COLOUR, {"band_width_nm": [10.0, 0.0, 10.0]}, "'band_width_nm' must be > 0"),
-        (WHITE, {"encoding": "gamma"}, "'encoding' must be one of 'srgb', 'sqrt', 'linear', got 'gamma'"),
+        (WHITE, {"encoding": "gamma"}, "'encoding' must be one of 'auto', 'srgb', 'sqrt', 'linear', got 'gamma'"),
         (WHITE, {"pitch_um": 0.0}, "'pitch_um' must be > 0"),
         (
             WHITE,

@@ -21,6 +21,8 @@ from foveasim._core.provenance import versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.threads import cached_property, default_threads
 from foveasim._core.validation import Ints, check_count
+from foveasim._io.encodings import FileEncoding
+from foveasim._io.images import EncodedPicture
 from foveasim.capture import Capture
 from foveasim.columns import COLUMNS, STORED, column_info, registered_by_user
 from foveasim.config import Shot, Source, build_shot, check_settings, put_setting, resolve_files
@@ -352,7 +354,7 @@ class Dataset:
 
     def _pixels_digest(self, picture: int) -> str:
         try:
-            return digest_of(self._pixels(picture))
+            return digest_of(self._picture(picture, "linear").pixels)  # as stored
         except FoveasimError:  # reported on access to the sample
             return ""
 
@@ -416,9 +418,11 @@ class Dataset:
         self._messages += messages
         return value
 
-    def _pixels(self, picture: int) -> NDArray[Any]:
-        pixels: NDArray[Any] = self._cached("picture", picture, lambda: self._pictures.picture(picture))
-        return pixels
+    def _picture(self, picture: int, encoding: FileEncoding) -> EncodedPicture:
+        found: EncodedPicture = self._cached(
+            "picture", [picture, encoding], lambda: self._pictures.picture(picture, encoding)
+        )
+        return found
 
     def _shot(self, index: int) -> Shot:
         return self._build(index, self._settings_of(index))
@@ -429,7 +433,8 @@ class Dataset:
         def scene() -> Scene:
             values = {key: value for key, value in settings["scene"].items() if key not in ("kind", "picture")}
             try:
-                return Scene.from_picture(self._pixels(picture), **values)
+                pixels: Any = self._picture(picture, values.get("encoding", "auto"))
+                return Scene.from_picture(pixels, **values)
             except ParameterError as error:
                 raise FileError(self._name_of(index), f"is not a valid picture for these settings: {error}") from None
 

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.names import missing_path
-from foveasim._io.images import PICTURE_EXTENSIONS, picture_names, pixels_of_image, read_picture
+from foveasim._io.encodings import FileEncoding
+from foveasim._io.images import PICTURE_EXTENSIONS, EncodedPicture, as_encoded, picture_names
 from foveasim.errors import FileError, ParameterError, type_name
 from foveasim.explore._files import digests, load_array
 from foveasim.explore.datasets.packed import PackedFiles, PackedStrings
@@ -42,8 +43,8 @@ class Source(ABC):
         return str(k)
 
     @abstractmethod
-    def picture(self, k: int) -> NDArray[Any]:
-        """Read a picture as :func:`foveasim._io.images.read_picture`, top row first."""
+    def picture(self, k: int, encoding: FileEncoding = "auto") -> EncodedPicture:
+        """Read a picture as :func:`foveasim._io.images.as_encoded`, top row first."""
 
     def labels(self) -> list[Any] | None:
         """Return the class of every picture if the source contains classes, else None."""
@@ -154,8 +155,8 @@ class _Directory(_Files):
     def name(self, k: int) -> str:
         return str(self._path / self._names[k])
 
-    def picture(self, k: int) -> NDArray[Any]:
-        return read_picture(self._path / self._names[k])
+    def picture(self, k: int, encoding: FileEncoding = "auto") -> EncodedPicture:
+        return as_encoded(self._path / self._names[k], encoding)
 
     def digest(self, k: int) -> str:
         return digest_of(self._path / self._names[k])
@@ -181,7 +182,7 @@ class _Zip(_Files):
     def name(self, k: int) -> str:
         return f"{self._path}!{self._names[k]}"
 
-    def picture(self, k: int) -> NDArray[Any]:
+    def picture(self, k: int, encoding: FileEncoding = "auto") -> EncodedPicture:
         archive, name = self._archive(), self._names[k]
         if archive.getinfo(name).file_size > MAX_DECOMPRESSED_BYTES:
             raise FileError(self.name(k), f"would decompress to more than {MAX_DECOMPRESSED_BYTES} bytes")
@@ -193,7 +194,7 @@ class _Zip(_Files):
             file = Path(directory) / f"picture{PurePosixPath(name).suffix}"
             file.write_bytes(content)
             try:
-                return read_picture(file)
+                return as_encoded(file, encoding)
             except FileError as error:
                 raise FileError(self.name(k), str(error).removeprefix(f"{file}: ")) from None
 
@@ -222,8 +223,8 @@ class _Array(Source):
     def name(self, k: int) -> str:
         return f"picture {k}"
 
-    def picture(self, k: int) -> NDArray[Any]:
-        return self._pictures[k]
+    def picture(self, k: int, encoding: FileEncoding = "auto") -> EncodedPicture:
+        return as_encoded(self._pictures[k], encoding)
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": "array", "shape": list(self._pictures.shape), "dtype": str(self._pictures.dtype)}
@@ -256,8 +257,8 @@ class _ArrayFile(Source):
     def name(self, k: int) -> str:
         return f"{self._path}[{k}]"
 
-    def picture(self, k: int) -> NDArray[Any]:
-        return np.array(self._array()[k])
+    def picture(self, k: int, encoding: FileEncoding = "auto") -> EncodedPicture:
+        return as_encoded(np.array(self._array()[k]), encoding)
 
     def to_dict(self) -> dict[str, Any]:
         array = self._array()
@@ -294,17 +295,17 @@ class _Items(Source):
         """Return an item of a list, or None if items may be computed on access."""
         return None if self.is_lazy else self._item(k)
 
-    def picture(self, k: int) -> NDArray[Any]:
+    def picture(self, k: int, encoding: FileEncoding = "auto") -> EncodedPicture:
         item = self._item(k)
         if isinstance(item, str | Path):
-            return read_picture(item)
+            return as_encoded(item, encoding)
         if _is_image(item):
             try:
-                return pixels_of_image(item)
-            except Exception as error:  # noqa: BLE001 -- corrupt images raise many kinds of errors
-                raise FileError(self.name(k), f"is not a readable image ({' '.join(str(error).split())})") from None
+                return as_encoded(item, encoding)
+            except ParameterError as error:
+                raise FileError(self.name(k), f"is not a readable image: {error.detail}") from None
         try:
-            return np.asarray(item)
+            return as_encoded(np.asarray(item), encoding)
         except ValueError:
             raise ParameterError(f"picture {k}", "must be a file or an array of numbers", item) from None
 
@@ -333,7 +334,7 @@ class _Items(Source):
 
     def digest(self, k: int) -> str:
         item = self._item(k)
-        return digest_of(item if isinstance(item, str | Path) else self.picture(k))
+        return digest_of(item if isinstance(item, str | Path) else self.picture(k, "linear").pixels)
 
 
 def _is_image(item: Any) -> bool:
