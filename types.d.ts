@@ -117,8 +117,10 @@ interface SweepMessage {
 interface Exists { kind: "exists"; id: number; name: string; file: string }
 interface Saved { kind: "saved"; id: number; path: string }
 interface GazePathMessage { kind: "gaze_path"; rows: [number, number, number][]; problem: string; step_s: number }
+// Times of the frames of a video that are not at equal steps.
+interface FilmTimes { kind: "film_times"; times_s: number[] | null }
 type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved | Note | Progress | Exists | Sought | SweepMessage
-  | GazePathMessage;
+  | GazePathMessage | FilmTimes;
 
 // Binary messages: a header and arrays; as readPart returns them.
 interface PartHeader {

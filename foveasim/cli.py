@@ -595,14 +595,20 @@ def video(
         typer.Option(
             "--out",
             "-o",
-            help="A .zarr store with all codes, from which an interrupted video resumes; a .mp4, .webm or .gif file; or a "
-            "directory for pictures.",
+            help="A .zarr store with all codes, from which an interrupted video resumes; a .mp4, .webm, .gif or .webp file; or "
+            "a directory for pictures.",
         ),
     ] = Path("video.zarr"),
     changes: Changes = None,
     frames_per_s: FramesPerS = None,
     line_s: Annotated[float, typer.Option("--line-s", help="Line time of a rolling shutter in seconds.")] = 0.0,
     stop: Annotated[int | None, typer.Option("--stop", help="Maximum number of frames.")] = None,
+    times: Annotated[
+        Path | None,
+        typer.Option(
+            "--times", help="CSV file of the times of the frames in the column t_s, instead of --fps or times_s."
+        ),
+    ] = None,
     gaze: Annotated[
         Path | None,
         typer.Option(
@@ -625,7 +631,16 @@ def video(
     was_finished = is_store and out.exists()
     try:
         n = run_video(
-            shot, frames, out, frame_s=frame_s, line_s=line_s, stop=stop, gaze=gaze, n_threads=threads, progress=True
+            shot,
+            frames,
+            out,
+            frame_s=frame_s,
+            line_s=line_s,
+            stop=stop,
+            gaze=gaze,
+            n_threads=threads,
+            progress=True,
+            times_s=times,
         )
     except KeyboardInterrupt:
         n = count_recorded_frames(out) if is_store and partial_path(out).is_dir() else 0

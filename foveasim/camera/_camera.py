@@ -641,6 +641,7 @@ class Camera:
         every: Annotated[int, Limits(at_least=1)] = 1,
         between: Between = "hold",
         ahead: Annotated[int, NOT_NEGATIVE] = 0,
+        times_s: ArrayLike | None = None,
     ) -> Iterator[Capture]:
         """
         Yield captures of a sequence of frames, each computed on demand.
@@ -660,9 +661,10 @@ class Camera:
             Number of the first capture: capture k has the noise of ``capture(..., frame=first_frame + k)``. To resume a
             video, pass the frames from number ``first_frame * every``.
         frame_s : float, optional, s
-            Frame period. Without it each frame is exposed separately.
+            Frame period. Without it and ``times_s`` each frame is exposed separately.
         line_s : float, s
-            Line time of a rolling shutter: a site starts ``readout_order * line_s`` after the first. Requires ``frame_s``.
+            Line time of a rolling shutter: a site starts ``readout_order * line_s`` after the first. Requires times of the
+            frames.
         every : int
             Number of frames per capture.
         between : {"hold", "linear"}
@@ -671,6 +673,10 @@ class Camera:
             Number of frames to compute in advance, each in one thread. This can be faster than one frame in all threads for
             frames that are slow to read, or with many cores; on two cores it is slower. Only for frames that do not depend on
             earlier captures.
+        times_s : (n_frame,) float64, s
+            Times of the frames in strictly ascending order, such as the time stamps of a video, instead of ``frame_s``. Default
+            for ``line_s``, ``every`` and ``between``: those that the frames carry, as a :class:`foveasim.video.FrameSource` and
+            the frames along a :class:`foveasim.video.GazePath` do. The time of each capture is the setting ``time_s``.
 
         Raises
         ------
@@ -691,8 +697,8 @@ class Camera:
         photosites' outlines, so that fractions of a cell are exact. The layout is compiled for the position (0, 0) only: most
         others occur once, and repeated ones give bit-identical rates.
 
-        With ``frame_s``, a capture integrates all frames during its exposure, weighted by their time; the last frame lasts
-        until the last exposure ends.
+        With ``frame_s`` or ``times_s``, a capture integrates all frames during its exposure, weighted by their time; the last
+        frame lasts until the last exposure ends.
 
         Examples
         --------
@@ -715,6 +721,7 @@ class Camera:
             every=every,
             between=between,
             ahead=ahead,
+            times_s=times_s,
         )
 
     def predict(

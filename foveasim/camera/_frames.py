@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from hashlib import blake2b
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from foveasim._core.validation import Floats, finite_array
 from foveasim.errors import ParameterError, type_name
 from foveasim.fields import Grid, PowerMap
+from foveasim.modes.frame_times import FrameTimes
 from foveasim.scene import Scene
 
 #: A position in the image plane, (x, y) in µm.
@@ -22,6 +23,8 @@ Frame = Scene | PowerMap | tuple[Scene | PowerMap, Sequence[float]]
 #: Power maps behind each colour filter, on each grid.
 ImageCache = dict[tuple[Grid, int], NDArray[Any]]
 
+
+T = TypeVar("T")
 
 #: Length of the digest of a path.
 DIGEST_BYTES = 16
@@ -39,19 +42,60 @@ class PathPosition(tuple[float, float]):  # noqa: SLOT001 -- tuples have no slot
         For every point, digest of the path from it to the end; the last is that of no point.
     number : int
         Number of the point.
+    time_s : float or None, s
+        Time of the point, if the path has times.
     """
 
     gaze_um: Position
     digests: Sequence[bytes]
     number: int
+    time_s: float | None
 
     def __new__(
-        cls, position_um: Position, gaze_um: Position = (0.0, 0.0), digests: Sequence[bytes] = (), number: int = 0
+        cls,
+        position_um: Position,
+        gaze_um: Position = (0.0, 0.0),
+        digests: Sequence[bytes] = (),
+        number: int = 0,
+        time_s: float | None = None,
     ) -> Self:
         """Create the position of a point; pickles set the attributes afterwards."""
         new = super().__new__(cls, position_um)
-        new.gaze_um, new.digests, new.number = gaze_um, digests, number
+        new.gaze_um, new.digests, new.number, new.time_s = gaze_um, digests, number, time_s
         return new
+
+
+class TimedFrames(Iterator[T]):
+    """Frames with positions, and their times, which :meth:`foveasim.Camera.video` uses."""
+
+    def __init__(self, frames: Iterable[T], times: FrameTimes) -> None:
+        self._frames, self._times, self._n_read = iter(frames), times, 0
+
+    def __next__(self) -> T:
+        found = next(self._frames)
+        self._n_read += 1
+        return found
+
+    @property
+    def times_s(self) -> Floats | None:
+        """Times of the frames that have not been read, (n,) s; None at equal steps, or if all have been read."""
+        times_s = self._times.times_s
+        return None if times_s is None or self._n_read >= times_s.size else times_s[self._n_read :]
+
+    @property
+    def frame_s(self) -> float | None:
+        """Frame period in s; None for other times."""
+        return self._times.frame_s
+
+
+def carried_times(frames: object) -> FrameTimes | None:
+    """
+    Return the times that frames carry, as ``times_s`` or ``frame_s``; None if they have none.
+
+    Raises FileError for a video file without time stamps.
+    """
+    times_s, frame_s = getattr(frames, "times_s", None), getattr(frames, "frame_s", None)
+    return FrameTimes.of(None if times_s is not None else frame_s, times_s)
 
 
 def path_digests(gaze_um: Floats) -> list[bytes]:
@@ -68,11 +112,12 @@ def path_digests(gaze_um: Floats) -> list[bytes]:
     return digests
 
 
-def path_positions(gaze_um: Floats) -> Iterator[PathPosition]:
-    """Yield the points of a path, (n, 2) µm, as sensor positions."""
+def path_positions(gaze_um: Floats, times_s: Floats | None = None) -> Iterator[PathPosition]:
+    """Yield the points of a path, (n, 2) µm, as sensor positions; ``times_s``: their times, (n,) s."""
     digests = path_digests(gaze_um)
     for k, (x_um, y_um) in enumerate(gaze_um.tolist()):
-        yield PathPosition((x_um, y_um), (x_um, y_um), digests, k)
+        time_s = None if times_s is None else float(times_s[k])
+        yield PathPosition((x_um, y_um), (x_um, y_um), digests, k, time_s)
 
 
 class Task(NamedTuple):
@@ -156,5 +201,5 @@ def _split_frame(frame: Frame) -> tuple[Scene | PowerMap, Position]:
     found = float(position_um[0]), float(position_um[1])
     given = frame[1]
     if isinstance(given, PathPosition):
-        return frame[0], PathPosition(found, given.gaze_um, given.digests, given.number)
+        return frame[0], PathPosition(found, given.gaze_um, given.digests, given.number, given.time_s)
     return frame[0], found

@@ -27,6 +27,7 @@ from foveasim.distortion import LENSES
 from foveasim.errors import ParameterError
 from foveasim.layout import EDITS, LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing, read_layout
 from foveasim.maps import read_power_map
+from foveasim.modes.frame_times import check_times
 from foveasim.optics import PUPILS, ChiefRayTable, IlluminationTable, LateralColour, Optics, Seidel, Zernike, read_psfs
 from foveasim.scene import SCENES
 from foveasim.sensor import (
@@ -191,6 +192,16 @@ def _check_gaze_path(rows: list[list[float]]) -> list[list[float]]:
     return rows
 
 
+def _check_frame_times(times_s: list[float]) -> list[float]:
+    """Check the times of the frames of a video."""
+    try:
+        check_times("times_s", times_s)
+    except ParameterError as error:
+        raise ValueError(error.detail) from None
+    return times_s
+
+
+_FrameTimes: Any = Annotated[list[float], AfterValidator(_check_frame_times)]
 #: Rows of a gaze path, whose message names the row.
 _GazeRow: Any = Annotated[list[float], Field(json_schema_extra={"minItems": 3, "maxItems": 3})]
 _GazeRows: Any = Annotated[list[_GazeRow], AfterValidator(_check_gaze_path)]
@@ -276,6 +287,16 @@ def _models(_versions: tuple[int, ...]) -> Models:
                 description=(
                     "gaze of the frames of a video (foveasim video): rows [t_s, x_um, y_um], with straight lines between "
                     "them, or a CSV file with these columns; a single capture has the gaze gaze_um"
+                ),
+            ),
+        ),
+        "times_s": (
+            _FrameTimes | str | None,
+            Field(
+                None,
+                description=(
+                    "times of the frames of a video in s, in ascending order (foveasim video --frames DIRECTORY), or a CSV "
+                    "file with the column t_s; those of a video file are its time stamps"
                 ),
             ),
         ),

@@ -16,7 +16,8 @@ from foveasim._core.names import possible_names
 from foveasim._core.random_streams import Streams
 from foveasim._core.short_repr import short_repr
 from foveasim._core.threads import cached_property
-from foveasim._core.validation import check_choice
+from foveasim._core.validation import Floats, check_choice
+from foveasim._io.encodings import Encoding
 from foveasim._io.images import read_picture
 from foveasim._io.yaml_files import parse_yaml, read_yaml
 from foveasim.camera import Camera
@@ -36,13 +37,14 @@ from foveasim.scene import Scene
 from foveasim.scene._scene import FRAMINGS
 from foveasim.sensor import Sensor
 from foveasim.video import GazePath
+from foveasim.video.frame_source import read_times
 
 #: Prefix of the names of pictures that scikit-image contains.
 BUNDLED_PICTURE = "skimage:"
 #: Extensions of settings files; the format of other layout files follows from their content.
 YAML_EXTENSIONS = (".yaml", ".yml")
 #: Settings whose value may be a file.
-FILE_SETTINGS = ("density", "file", "gaze_path", "importance", "layers", "layout", "path", "picture")
+FILE_SETTINGS = ("density", "file", "gaze_path", "importance", "layers", "layout", "path", "picture", "times_s")
 #: Option of the command line that replaces settings.
 CHANGE = "--set"
 #: Keys of a layout that take effect at its edits or later: they do not change the generated photosites.
@@ -93,6 +95,10 @@ class Shot:
         Conditions on results, which :func:`foveasim.explore.check_requirements` checks.
     gaze_source : GazePath, Path or None
         Gaze path of videos, or its CSV file.
+    times_source : (n_frame,) float64 s, Path or None
+        Times of the frames of a video, or their CSV file.
+    frame_encoding : str or None
+        Encoding of the scene's picture, if it is specified; frames of a video have it too.
     """
 
     name: str
@@ -103,6 +109,8 @@ class Shot:
     seed: int
     requirements: tuple[Requirement, ...] = ()
     gaze_source: GazePath | Path | None = None
+    times_source: Floats | Path | None = None
+    frame_encoding: Encoding | None = None
 
     __repr__ = short_repr
 
@@ -110,6 +118,11 @@ class Shot:
     def gaze_path(self) -> GazePath | None:
         """Gaze path of videos; a CSV file is read when the path is first required."""
         return GazePath.read(self.gaze_source) if isinstance(self.gaze_source, Path) else self.gaze_source
+
+    @cached_property
+    def times_s(self) -> Floats | None:
+        """Times of the frames of a video; a CSV file is read when they are first required."""
+        return read_times(self.times_source) if isinstance(self.times_source, Path) else self.times_source
 
     @cached_property
     def exposure_s(self) -> float:
@@ -315,6 +328,10 @@ def build_shot(
         seed=streams.seed,
         requirements=tuple(_build(source, "requirements", settings.requirements or [])),
         gaze_source=_gaze_source(source, settings.gaze_path),
+        times_source=_times_source(source, settings.times_s),
+        frame_encoding=getattr(settings.scene, "encoding", None)
+        if "encoding" in settings.scene.model_fields_set
+        else None,
     )
 
 
@@ -323,6 +340,13 @@ def _gaze_source(source: Source, rows: list[list[float]] | str | None) -> GazePa
     if isinstance(rows, str):
         return source.directory / rows
     return None if rows is None else GazePath.from_rows(rows)
+
+
+def _times_source(source: Source, times_s: list[float] | str | None) -> Floats | Path | None:
+    """Return the times of checked settings, or their file."""
+    if isinstance(times_s, str):
+        return source.directory / times_s
+    return None if times_s is None else np.array(times_s, np.float64)
 
 
 def read_layout_file(path: str | Path) -> LayoutFile:

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import ArrayLike
+
+from foveasim._core.calls import OwnCheck
 from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.threads import thread_count
+from foveasim.capture import Capture
 from foveasim.config._objects import Shot
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.scene import Scene
 from foveasim.video import FrameSource, GazePath, count_recorded_frames, follow_gaze, write_video
 from foveasim.video.frame_source import list_pictures
+from foveasim.video.writing import DEFAULT_FRAME_S
 
-#: Frame period in video files when none is specified.
-DEFAULT_FRAME_S = 1.0 / 25.0
 #: Attributes of the scene that the frames replace.
 FRAME_ATTRIBUTES = ("basis", "source")
 
@@ -34,6 +38,7 @@ def run_video(
     gaze: str | Path | None = None,
     n_threads: int | None = None,
     progress: bool = False,
+    times_s: OwnCheck[str | Path | ArrayLike | None] = None,
 ) -> int:
     """
     Simulate and write a video with a shot's camera; an interrupted zarr store resumes.
@@ -47,7 +52,7 @@ def run_video(
     out : path
         As for :func:`foveasim.video.write_video`. A complete zarr store is not changed.
     frame_s : float, optional, s
-        Frame period; by default that of the video file.
+        Frame period; by default the frames have the times of the shot (``times_s``) or the time stamps of the video file.
     line_s : float, s
         Line time of a rolling shutter.
     stop : int, optional
@@ -59,6 +64,8 @@ def run_video(
         Number of frames that are computed at a time; one per core by default.
     progress : bool
         Whether to show a progress bar.
+    times_s : (n_frame,) float64, or path, optional, s
+        Times of the frames, or a CSV file with the column ``t_s``, instead of those of the shot.
 
     Returns
     -------
@@ -82,33 +89,41 @@ def run_video(
         raise SimulationError(
             f"{shot.name} has a power map; frames require a scene, which specifies the size of their pixels"
         )
-    source = FrameSource(frames, template=shot.scene, frame_s=frame_s, stop=stop)
-    if line_s and source.frame_s is None:
+    if times_s is None and frame_s is None:
+        times_s = shot.times_s
+    encoding: dict[str, Any] = {} if shot.frame_encoding is None else {"encoding": shot.frame_encoding}
+    source = FrameSource(frames, template=shot.scene, frame_s=frame_s, times_s=times_s, stop=stop, **encoding)
+    step_s = source.frame_s
+    is_irregular = step_s is None and source.times_s is not None
+    if line_s and step_s is None and not is_irregular:
         raise ParameterError(
-            "frame_s", "must be given for a rolling shutter: pictures in a directory have no frame rate"
+            "frame_s", "or 'times_s' must be given for a rolling shutter: pictures in a directory have no times"
         )
     path = shot.gaze_path if gaze is None else GazePath.read(gaze)
-    frame_period_s = source.frame_s or DEFAULT_FRAME_S
     is_store = Path(out).suffix.lower() == ".zarr"
     n_before = count_recorded_frames(out) if is_store else 0
     scenes = source.from_frame(n_before)
-    captures = shot.camera.video(
-        scenes if path is None else follow_gaze(scenes, path, frame_s=frame_period_s, first_frame=n_before),
-        exposure_s=shot.requested_s,
-        seed=shot.seed,
-        first_frame=n_before,
-        frame_s=source.frame_s if line_s else None,
-        line_s=line_s,
-        ahead=thread_count(n_threads),
-    )
+    captures: Iterable[Capture] = ()
+    if not is_irregular or scenes.times_s is not None:  # otherwise the recording has all frames
+        of_path: dict[str, Any] = (
+            {} if is_irregular else {"frame_s": step_s or DEFAULT_FRAME_S, "first_frame": n_before}
+        )
+        captures = shot.camera.video(
+            scenes if path is None else follow_gaze(scenes, path, **of_path),
+            exposure_s=shot.requested_s,
+            seed=shot.seed,
+            first_frame=n_before,
+            frame_s=step_s if line_s else None,
+            line_s=line_s,
+            ahead=thread_count(n_threads),
+        )
     return write_video(
         captures,
         out,
-        frame_s=frame_period_s,
         n_frames=source.n_frames,
         progress=progress,
         resume=is_store,
-        plan=_plan(shot, shot.scene, Path(frames), source.frame_s, line_s, stop, path) if is_store else None,
+        plan=_plan(shot, shot.scene, Path(frames), source, line_s, stop, path) if is_store else None,
     )
 
 
@@ -116,7 +131,7 @@ def _plan(
     shot: Shot,
     scene: Scene,
     frames: Path,
-    frame_s: float | None,
+    source: FrameSource,
     line_s: float,
     stop: int | None,
     path: GazePath | None,
@@ -136,7 +151,9 @@ def _plan(
         "exposure_s": shot.requested_s,
         "seed": shot.seed,
         "frames": hashlib.sha256(json.dumps(files).encode()).hexdigest(),
-        "shutter": {"frame_s": frame_s, "line_s": line_s} if line_s else None,
+        "encoding": shot.frame_encoding,
+        "shutter": {"frame_s": source.frame_s, "line_s": line_s} if line_s else None,
+        "times_s": None if source.frame_s is not None else to_plain_data(source.times_s),
         "stop": stop,
         "gaze": {"gaze_um": camera.gaze_um, "axis": camera.axis, "path": None if path is None else to_plain_data(path)},
         "versions": versions(),

@@ -38,7 +38,7 @@ GROWING_KINDS = ("camera", "images")
 MAX_DEPTH = 6
 #: Sections of the settings of a shot that do not change the photoelectron rates, and others that do not change the optical
 #: images; the responsivity of the sensor changes both.
-AFTER_LIGHT = ("sensor", "exposure_s", "seed", "requirements", "gaze_path")
+AFTER_LIGHT = ("sensor", "exposure_s", "seed", "requirements", "gaze_path", "times_s")
 AFTER_IMAGE = ("layout", "distortion", "integration_order", "gaze_um", "axis")
 #: Longest stored message, characters.
 MAX_MESSAGE_LENGTH = 500

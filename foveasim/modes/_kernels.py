@@ -103,25 +103,25 @@ def _crossing(slope, swing, tau, begin, difference, on, off, end):
 
 @njit(
     types.int64(
-        FLOATS_2D, FLOATS_2D, types.float64, types.int64, FLOATS, FLOATS, FLOATS, types.float64, types.float64,
+        FLOATS_2D, FLOATS_2D, FLOATS, FLOATS, FLOATS, FLOATS, FLOATS, types.float64, types.float64,
         types.float64, types.float64, types.uint64, types.uint64, types.int64, types.int64,
         types.float64[:, ::1], _counts, _counts, types.float64[::1], _sites, _bytes,
     ),
 )  # fmt: skip
 def change_events(
-    log_current, current, frame_s, first_frame, on, off, leak_per_s, refractory_s, tau_e, noise_per_s, noise_half,
+    log_current, current, begins_s, steps_s, on, off, leak_per_s, refractory_s, tau_e, noise_per_s, noise_half,
     key_0, key_1, first_site, max_events, memory, n_drawn, ends, t_s, site, polarity,
 ):  # fmt: skip
     """
     Compute the change events of some sites between the first and the last of some frames.
 
-    ``log_current`` and ``current`` are (n_frame, n_site); frame k is at ``(first_frame + k) * frame_s``. The log current is
-    interpolated linearly between frames. ``tau_e`` divided by the current is the time constant of the low pass; 0 disables it.
-    Returns the number of events, including those that did not fit the arrays.
+    ``log_current`` and ``current`` are (n_frame, n_site); frame k is at ``begins_s[k]``, and the next one ``steps_s[k]`` later.
+    The log current is interpolated linearly between frames. ``tau_e`` divided by the current is the time constant of the low
+    pass; 0 disables it. Returns the number of events, including those that did not fit the arrays.
     """
     n = 0
     for k in range(log_current.shape[0] - 1):
-        begin_s, end_s = (first_frame + k) * frame_s, (first_frame + k + 1) * frame_s
+        begin_s, end_s, frame_s = begins_s[k], begins_s[k + 1], steps_s[k]
         after_s = np.nextafter(begin_s, math.inf)
         for i in range(log_current.shape[1]):
             up, down = on[i if on.size > 1 else 0], off[i if off.size > 1 else 0]
@@ -201,25 +201,25 @@ def _gamma(shape, key_0, key_1, site, number):
 
 @njit(
     types.int64(
-        FLOATS_2D, types.float64, types.int64, FLOATS, types.float64, types.boolean, types.uint64, types.uint64, types.int64,
+        FLOATS_2D, FLOATS, FLOATS, FLOATS, types.float64, types.boolean, types.uint64, types.uint64, types.int64,
         types.int64, types.float64[:, ::1], _counts, _counts, types.float64[::1], _sites, _bytes,
     ),
 )  # fmt: skip
 def charge_spikes(
-    current, frame_s, first_frame, threshold_e, refractory_s, is_noisy, key_0, key_1, first_site,
+    current, begins_s, steps_s, threshold_e, refractory_s, is_noisy, key_0, key_1, first_site,
     max_events, memory, n_drawn, ends, t_s, site, polarity,
 ):  # fmt: skip
     """
     Compute the spikes of some sites during some frames.
 
-    ``current`` is (n_frame, n_site) and constant during each frame. With noise, electrons arrive as a Poisson process, and the
-    time to a threshold of N electrons follows the gamma distribution of shape N. Returns the number of spikes, including those
-    that did not fit the arrays.
+    ``current`` is (n_frame, n_site) and constant during each frame, which begins at ``begins_s[k]`` and lasts ``steps_s[k]``.
+    With noise, electrons arrive as a Poisson process, and the time to a threshold of N electrons follows the gamma distribution
+    of shape N. Returns the number of spikes, including those that did not fit the arrays.
     """
     n = 0
     for k in range(current.shape[0]):
-        begin_s = (first_frame + k) * frame_s
-        last_s = np.nextafter((first_frame + k + 1) * frame_s, -math.inf)
+        begin_s, frame_s = begins_s[k], steps_s[k]
+        last_s = np.nextafter(begins_s[k + 1], -math.inf)
         for i in range(current.shape[1]):
             rate, threshold = current[k, i], threshold_e[i if threshold_e.size > 1 else 0]
             u = min(max(memory[i, REFRACTORY_END] - begin_s, 0.0), frame_s)

@@ -25,6 +25,7 @@ from foveasim._core.validation import Floats, Ints, check_per_site, finite_array
 from foveasim.errors import ParameterError, SimulationError, type_name
 from foveasim.layout.model import Layout
 from foveasim.modes.events import Events
+from foveasim.modes.frame_times import FrameTimes
 from foveasim.sensor import Sensor
 from foveasim.sensor.effects import ShotNoise
 from foveasim.sensor.limits import CHARGE, DURATION, EXPOSURE, RATE, SPREAD, TEMPERATURE, WIDE_SPREAD
@@ -60,10 +61,11 @@ class _Pixels:
         self,
         rates: OwnCheck[Iterable[ArrayLike]],
         *,
-        frame_s: Annotated[float, DURATION],
+        frame_s: Annotated[float | None, DURATION] = None,
         seed: Annotated[int, NOT_NEGATIVE],
         batch: Annotated[int, Limits(at_least=1)] = 32,
         n_threads: int | None = None,
+        times_s: ArrayLike | None = None,
     ) -> Iterator[Events]:
         """
         Yield the events or spikes of successive batches of frames.
@@ -80,6 +82,8 @@ class _Pixels:
             Frames per batch; events do not depend on it.
         n_threads : int, optional
             Number of threads, by default all cores. Events do not depend on it.
+        times_s : (n_frame,) float64, s
+            Times of the frames in strictly ascending order, instead of ``frame_s``; events have times on the same axis.
 
         Yields
         ------
@@ -89,24 +93,35 @@ class _Pixels:
         Raises
         ------
         ParameterError
-            Immediately when a value is out of range; during iteration when a frame does not have one rate >= 0 per site.
+            Immediately when a value is out of range, or not exactly one of ``frame_s`` and ``times_s`` is given; during
+            iteration when a frame does not have one rate >= 0 per site, or there is not one time per frame.
         SimulationError
             When the events do not fit in memory, or the current of a site of :class:`EventPixels` is zero.
         """
         _check_rates(rates)
         key = fixed_pattern_key(seed, self._noise_name)
-        return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
+        times = FrameTimes.of(frame_s, times_s, frames=rates)
+        if times is None:
+            raise ParameterError("frame_s", "must be given, or 'times_s'")
+        return self._stream(rates, times, key, batch, thread_count(n_threads))
 
     def events(
-        self, rates: OwnCheck[Iterable[ArrayLike]], *, frame_s: float, seed: int, n_threads: int | None = None
+        self,
+        rates: OwnCheck[Iterable[ArrayLike]],
+        *,
+        frame_s: float | None = None,
+        seed: int,
+        n_threads: int | None = None,
+        times_s: ArrayLike | None = None,
     ) -> Events:
         """Return all events at once; parameters as for :meth:`stream`."""
         empty = Events(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int8), _layout(self.sensor))
-        return Events.concatenate([empty, *self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads)])
+        batches = self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads, times_s=times_s)
+        return Events.concatenate([empty, *batches])
 
     @abstractmethod
     def _stream(
-        self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
+        self, rates: Iterable[ArrayLike], times: FrameTimes, key: tuple[Any, Any], batch: int, n_threads: int
     ) -> Iterator[Events]:
         """Yield the events of batches; the arguments are valid."""
 
@@ -144,11 +159,11 @@ class EventPixels(_Pixels):
 
     Notes
     -----
-    The logarithm L(t) of the photocurrent I is interpolated linearly between frames, and event times are the threshold
-    crossings to machine precision. The photoreceptor is a low pass, ``dV/dt = (L - V) / tau`` with ``tau = C (kT/q) / I``, so
-    its corner frequency ``1 / (2 pi tau)`` is proportional to the photocurrent; I is the mean current of each part of a frame
-    in which L changes by at most 0.25. An event sets the reference of the site to its level at the end of the refractory time;
-    leakage lowers the reference. The frame rate should be so high that L changes little between frames.
+    The logarithm L(t) of the photocurrent I is interpolated linearly between frames, at their times, and event times are the
+    threshold crossings to machine precision. The photoreceptor is a low pass, ``dV/dt = (L - V) / tau`` with ``tau = C (kT/q) /
+    I``, so its corner frequency ``1 / (2 pi tau)`` is proportional to the photocurrent; I is the mean current of each part of a
+    frame in which L changes by at most 0.25. An event sets the reference of the site to its level at the end of the refractory
+    time; leakage lowers the reference. The frame rate should be so high that L changes little between frames.
 
     The initial phase of the leak of each site is random, drawn with the noise, so that leak events of different sites are not
     synchronous. An event at the boundary of two frames belongs to the first.
@@ -211,7 +226,7 @@ class EventPixels(_Pixels):
         return read_only(self.leak_per_s * self.sensor.device.log_normals("event leak", self.leak_spread_fraction))
 
     def _stream(
-        self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
+        self, rates: Iterable[ArrayLike], times: FrameTimes, key: tuple[Any, Any], batch: int, n_threads: int
     ) -> Iterator[Events]:
         from foveasim.modes import _kernels
 
@@ -221,7 +236,7 @@ class EventPixels(_Pixels):
         n_drawn = np.zeros(self.sensor.layout.n_sites, np.int64)
         n_before = 0
         last_current: Floats | None = None
-        for dark_current in _batches(self.sensor, rates, batch):
+        for dark_current in _batches(self.sensor, rates, batch, times):
             current = dark_current + self.floor_e_per_s
             if not current.min(initial=np.inf) > 0.0:
                 site = int(np.flatnonzero((current <= 0.0).any(axis=0))[0])
@@ -234,15 +249,15 @@ class EventPixels(_Pixels):
             else:
                 frames = np.concatenate((last_current, current))
                 log_current = np.log(frames)
-            first = max(n_before - 1, 0)
+            begins_s, steps_s = times.of_frames(max(n_before - 1, 0), frames.shape[0])
 
             def run_kernel(sites: slice, max_events: int, *out: NDArray[Any]) -> int:
                 return int(
                     _kernels.change_events(
                         np.ascontiguousarray(log_current[:, sites]),  # noqa: B023 -- called in this iteration
                         np.ascontiguousarray(frames[:, sites]),  # noqa: B023
-                        frame_s,
-                        first,  # noqa: B023
+                        begins_s,  # noqa: B023
+                        steps_s,  # noqa: B023
                         _part(on, sites),
                         _part(off, sites),
                         _part(leaks_per_s, sites),
@@ -282,7 +297,8 @@ class SpikingPixels(_Pixels):
     Without noise, the spike rate is ``1 / (N_th / I + refractory)`` for a current of I electrons per second. With noise, the
     time to a threshold of N electrons follows the gamma distribution of shape N, which is sampled exactly; the relative
     standard deviation of intervals is ``1 / sqrt(N)``. Collected charge is retained between frames. Rates are constant during
-    each frame: frame k lasts from ``k frame_s`` to ``(k + 1) frame_s``.
+    each frame: frame k lasts from ``k frame_s`` to ``(k + 1) frame_s``, or from ``times_s[k]`` to ``times_s[k + 1]``, the last
+    one as long as the one before it.
 
     Examples
     --------
@@ -310,16 +326,21 @@ class SpikingPixels(_Pixels):
         check_declared(self, n_sites=self.sensor.layout.n_sites)
 
     def _stream(
-        self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
+        self, rates: Iterable[ArrayLike], times: FrameTimes, key: tuple[Any, Any], batch: int, n_threads: int
     ) -> Iterator[Events]:
         from foveasim.modes import _kernels
 
+        if times.times_s is not None and times.times_s.size == 1:
+            raise ParameterError(
+                "times_s", "must be two or more times: the duration of a single frame is unknown; use 'frame_s'"
+            )
         threshold_e = np.atleast_1d(np.asarray(self.threshold_e, np.float64))
         memory = np.zeros((self.sensor.layout.n_sites, 4))
         n_drawn = np.zeros(self.sensor.layout.n_sites, np.int64)
         first = 0
-        for current in _batches(self.sensor, rates, batch):
-            expected = current / (threshold_e + self.refractory_s * current) * frame_s
+        for current in _batches(self.sensor, rates, batch, times):
+            begins_s, steps_s = times.of_frames(first, current.shape[0])
+            expected = current / (threshold_e + self.refractory_s * current) * steps_s[:, np.newaxis]
             if expected.sum() > MAX_EVENTS:
                 raise SimulationError(
                     f"{expected.sum():.3g} spikes in {current.shape[0]} frames do not fit in memory; use a smaller 'batch', a "
@@ -330,8 +351,8 @@ class SpikingPixels(_Pixels):
                 return int(
                     _kernels.charge_spikes(
                         np.ascontiguousarray(current[:, sites]),  # noqa: B023 -- called in this iteration
-                        frame_s,
-                        first,  # noqa: B023
+                        begins_s,  # noqa: B023
+                        steps_s,  # noqa: B023
                         _part(threshold_e, sites),
                         self.refractory_s,
                         self.sensor.collection.is_drawn,
@@ -368,20 +389,23 @@ def _part(values: Floats, sites: slice) -> Floats:
     return values[sites] if values.size > 1 else values
 
 
-def _batches(sensor: Sensor, rates: Iterable[ArrayLike], batch: int) -> Iterator[Floats]:
+def _batches(sensor: Sensor, rates: Iterable[ArrayLike], batch: int, times: FrameTimes) -> Iterator[Floats]:
     """
     Yield the currents of batches of frames, (n_frame, n_site) e-/s.
 
     Currents include dark signal and crosstalk.
     """
     n_sites = sensor.layout.n_sites
-    remaining = iter(rates)
+    remaining, n_before = iter(rates), 0
     while rows := list(islice(remaining, batch)):
+        n_before += len(rows)
+        times.check_number(n_before - 1)
         current = np.empty((len(rows), n_sites))
         for k, row in enumerate(rows):
             rate = check_per_site("rates", finite_array("rates", row, at_least=0.0), n_sites)
             current[k] = sensor.expected_electrons(rate, 1.0)
         yield current
+    times.check_complete(n_before)
 
 
 def _collect_events(

@@ -1,13 +1,14 @@
 """
 Rolling shutters: overlap of the exposure of each photosite with the frames of a scene.
 
-The exposure of a site begins ``readout_order * line_s`` after the first. Irradiance is given in frames, ``frame_s`` apart: it
-is constant until the next frame, or interpolated linearly between frames.
+The exposure of a site begins ``readout_order * line_s`` after the first. Irradiance is given in frames, ``frame_s`` apart or at
+``times_s``: it is constant until the next frame, or interpolated linearly between frames.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
@@ -15,8 +16,9 @@ import numpy as np
 from foveasim._core.calls import NOT_NEGATIVE, check_declared
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_per_site, finite_array
-from foveasim.errors import SimulationError
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout.model import Layout
+from foveasim.modes.frame_times import FrameTimes
 from foveasim.sensor.limits import DURATION, EXPOSURE
 
 __all__ = ["Between", "Exposure", "Shutter"]
@@ -42,9 +44,13 @@ class Shutter:
         Line time, between the starts of exposure of successive lines; 0 for a global shutter.
     between : {"hold", "linear"}
         Irradiance between frames: constant until the next frame, or linear interpolation.
+    times_s : (n_frame,) float64, s
+        Times of the frames in strictly ascending order, instead of ``frame_s``. After the last one irradiance is constant.
 
     Raises
     ------
+    ParameterError
+        When not exactly one of ``frame_s`` and ``times_s`` is given, or the times are not ascending.
     SimulationError
         When ``line_s`` is not 0 and the layout has no column ``readout_order``.
 
@@ -57,17 +63,30 @@ class Shutter:
     >>> shutter = Shutter(layout, frame_s=1.5, line_s=0.5)
     >>> [shutter.overlap_fraction(frame, 2.0).tolist() for frame in range(3)]
     [[0.75, 0.5], [0.25, 0.5], [0.0, 0.0]]
+
+    The second frame of three lasts from 0.5 s to 2 s:
+
+    >>> shutter = Shutter(layout, times_s=[0.0, 0.5, 2.0], line_s=0.5)
+    >>> [shutter.overlap_fraction(frame, 2.0).tolist() for frame in range(3)]
+    [[0.25, 0.0], [0.75, 0.75], [0.0, 0.25]]
     """
 
     layout: Layout
-    frame_s: Annotated[float, DURATION]
+    frame_s: Annotated[float | None, DURATION] = None
     line_s: Annotated[float, EXPOSURE] = 0.0
     between: Between = "hold"
+    times_s: Floats | None = None
+    times: FrameTimes = field(init=False, repr=False)
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_declared(self)
+        times = FrameTimes.of(self.frame_s, self.times_s)
+        if times is None:
+            raise ParameterError("frame_s", "must be given, or 'times_s'")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "times_s", times.times_s)
         if self.line_s and "readout_order" not in self.layout.columns:
             raise SimulationError(
                 "a rolling shutter needs the line of each site; add a column 'readout_order' to the layout, for example with "
@@ -84,26 +103,42 @@ class Shutter:
         order = np.asarray(self.layout.columns["readout_order"], np.float64)
         return self.line_s * (order - order.min(initial=np.inf))
 
-    def overlap_fraction(self, frame: Annotated[int, NOT_NEGATIVE], exposure_s: Annotated[float, EXPOSURE]) -> Floats:
+    def overlap_fraction(
+        self,
+        frame: Annotated[int, NOT_NEGATIVE],
+        exposure_s: Annotated[float, EXPOSURE],
+        first_frame: Annotated[int, NOT_NEGATIVE] = 0,
+    ) -> Floats:
         """
         Return the weight of a frame in the exposure of each site, (n_site,) or (1,).
 
-        Frame 0 begins with the first line.
+        Frame 0 begins with the first line; it is the frame ``first_frame`` of ``times_s``.
         """
         delay_s = self.delay_s
-        if not exposure_s:  # instantaneous exposure
-            return np.where((delay_s >= frame * self.frame_s) & (delay_s < (frame + 1) * self.frame_s), 1.0, 0.0)
+        before_s, begin_s, end_s = (
+            self.times.after_s(first_frame + max(k, 0), first_frame) for k in (frame - 1, frame, frame + 1)
+        )
+        if begin_s == math.inf:
+            return np.zeros(1)
+        if not exposure_s and self.between == "linear":  # instantaneous exposure
+            rise_s, later_s = begin_s - before_s or math.inf, delay_s - begin_s
+            return np.clip(np.minimum(1.0 + later_s / rise_s, 1.0 - later_s / (end_s - begin_s)), 0.0, 1.0)
+        if not exposure_s:
+            return np.where((delay_s >= begin_s) & (delay_s < end_s), 1.0, 0.0)
         if self.between == "hold":
-            before, after = (np.clip((k * self.frame_s - delay_s) / exposure_s, 0.0, 1.0) for k in (frame, frame + 1))
+            before, after = (np.clip((t_s - delay_s) / exposure_s, 0.0, 1.0) for t_s in (begin_s, end_s))
             return np.asarray(after - before)
-        begin, end = (_hat_integral(t_s / self.frame_s - frame) for t_s in (delay_s, delay_s + exposure_s))
-        return np.asarray((end - begin) * (self.frame_s / exposure_s))
+        start, stop = (
+            _hat_integral(t_s - begin_s, begin_s - before_s, end_s - begin_s) for t_s in (delay_s, delay_s + exposure_s)
+        )
+        return np.asarray((stop - start) / exposure_s)
 
-    def last_frame(self, exposure_s: Annotated[float, EXPOSURE]) -> int:
-        """Return the last frame that overlaps the exposure of any site."""
-        end = (float(self.delay_s.max(initial=0.0)) + exposure_s) / self.frame_s
-        frames = int(np.ceil(end - TIME_ROUNDING))
-        return max(frames - 1, 0) if self.between == "hold" else frames
+    def last_frame(self, exposure_s: Annotated[float, EXPOSURE], first_frame: Annotated[int, NOT_NEGATIVE] = 0) -> int:
+        """Return the last frame that overlaps the exposure of any site, counted from ``first_frame``."""
+        end_s = float(self.delay_s.max(initial=0.0)) + exposure_s
+        last = self.times.last_before(end_s, first_frame, TIME_ROUNDING)
+        is_last = self.times.after_s(first_frame + last + 1, first_frame) == math.inf
+        return max(last, 0) if self.between == "hold" or is_last else last + 1
 
 
 class Exposure:
@@ -116,6 +151,8 @@ class Exposure:
         Exposure timing.
     exposure_s : float, s
         Exposure time; 0 for an instantaneous exposure.
+    first_frame : int
+        Number of the frame with which the exposure of the first line begins.
 
     Examples
     --------
@@ -131,10 +168,15 @@ class Exposure:
     (True, [100.0, 150.0])
     """
 
-    def __init__(self, shutter: Shutter, exposure_s: Annotated[float, EXPOSURE]) -> None:
-        self._shutter = shutter
+    def __init__(
+        self,
+        shutter: Shutter,
+        exposure_s: Annotated[float, EXPOSURE],
+        first_frame: Annotated[int, NOT_NEGATIVE] = 0,
+    ) -> None:
+        self._shutter, self._first = shutter, first_frame
         self.exposure_s: float = exposure_s
-        self._last = shutter.last_frame(exposure_s)
+        self._last = shutter.last_frame(exposure_s, first_frame)
         self._n_added = 0
         self._rate_e_per_s: Floats = np.zeros(1)
         self._weight: Floats = np.zeros(1)
@@ -151,7 +193,7 @@ class Exposure:
         """Add the photoelectron rates of the next frame, (n_site,) e-/s."""
         rate_e_per_s = self._validate_rate("rate_e_per_s", rate_e_per_s)
         if not self.is_complete:
-            weight = self._shutter.overlap_fraction(self._n_added, self.exposure_s)
+            weight = self._shutter.overlap_fraction(self._n_added, self.exposure_s, self._first)
             self._rate_e_per_s = self._rate_e_per_s + weight * rate_e_per_s
             self._weight = self._weight + weight
         self._n_added += 1
@@ -171,7 +213,13 @@ class Exposure:
         return check_per_site(name, finite_array(name, rate_e_per_s, at_least=0.0), self._shutter.layout.n_sites)
 
 
-def _hat_integral(x: Floats) -> Floats:
-    """Return the integral up to x of the triangular function of unit height on [-1, 1]."""
-    x = np.clip(x, -1.0, 1.0)
-    return np.where(x < 0.0, 0.5 * (1.0 + x) ** 2, 1.0 - 0.5 * (1.0 - x) ** 2)
+def _hat_integral(t_s: Floats, rise_s: float, fall_s: float) -> Floats:
+    """
+    Return the integral up to a time of a function that rises linearly to 1 at 0 and falls to 0 after it.
+
+    ``rise_s``: time before 0 at which it rises. ``fall_s``: time after 0 at which it is 0 again; infinite if it stays 1.
+    """
+    rising = np.clip(t_s, -rise_s, 0.0)
+    integral = 0.5 * (rise_s + rising) ** 2 / rise_s if rise_s else 0.0
+    falling = np.clip(t_s, 0.0, fall_s)
+    return np.asarray(integral + falling * (1.0 - 0.5 * falling / fall_s))

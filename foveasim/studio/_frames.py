@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from foveasim._io.images import write_picture
 from foveasim._io.videos import SandboxedVideo
-from foveasim.config._video import DEFAULT_FRAME_S
 from foveasim.errors import FileError, ParameterError
 from foveasim.studio._messages.models import CameraFrame, OpenVideo, ShowFrame, handles
 from foveasim.studio._settings.changes import with_picture
+from foveasim.video.frame_source import equal_step_s
+from foveasim.video.writing import DEFAULT_FRAME_S
 
 if TYPE_CHECKING:
     from foveasim.studio._session import Session
@@ -31,6 +32,8 @@ MAX_CAMERA_PIXELS = (1 << 20) // 3 - 1024
 DIGEST_LENGTH = 8
 #: Directory of the current frame, in the directory of uploaded files; settings cannot contain its files.
 HIDDEN = ".frames"
+#: Extensions of files that are a video or a single picture.
+PICTURE_OR_VIDEO = (".gif", ".webp")
 
 
 def camera_frame(message: bytes) -> CameraFrame:
@@ -66,15 +69,17 @@ class Frames:
         self._lock = threading.Lock()  # frames are exported in other threads
         self._directory, self._new_path = uploads / HIDDEN, new_path
         self._video: SandboxedVideo | None = None
+        self._step_s: float | None = None
+        self._sent_s: list[float] | None = None
         self._name = ""
         self._n_frames = 0
         self._number = 0
-        self._pixels: NDArray[np.uint8] | None = None
+        self._pixels: NDArray[Any] | None = None
         self._stored: Path | None = None
         self._n_stored = 0
-        self._reader: Iterator[NDArray[np.uint8]] | None = None
+        self._reader: Iterator[NDArray[Any]] | None = None
         self._next = 0
-        self._decoded: OrderedDict[int, NDArray[np.uint8]] = OrderedDict()
+        self._decoded: OrderedDict[int, NDArray[Any]] = OrderedDict()
 
     # -- sources ----------------------------------------------------------------------------------------------------
 
@@ -87,18 +92,19 @@ class Frames:
         """
         video = SandboxedVideo(path)
         n_frames = video.n_frames
-        if n_frames <= 1 and path.suffix.lower() == ".gif":
+        if n_frames <= 1 and path.suffix.lower() in PICTURE_OR_VIDEO:
             return False
         reader = video.pixels()
         first = next(reader)
         self.close()
         self._video, self._name, self._n_frames = video, path.name, n_frames
+        self._step_s = equal_step_s(video.times_s)
         self._reader, self._next = reader, 1
         self.path = self._new_path(f"{path.stem}.png")
         self._use(0, first)
         return True
 
-    def receive(self, pixels: NDArray[np.uint8], *, is_first: bool) -> bool:
+    def receive(self, pixels: NDArray[Any], *, is_first: bool) -> bool:
         """Use a frame of the camera; return False for a late frame of a camera that is not in use."""
         if is_first:
             self.close()
@@ -142,18 +148,38 @@ class Frames:
             while len(self._decoded) > 1 and sum(each.nbytes for each in self._decoded.values()) > MAX_DECODED_BYTES:
                 self._decoded.popitem(last=False)
 
-    def _use(self, number: int, pixels: NDArray[np.uint8]) -> None:
+    def _use(self, number: int, pixels: NDArray[Any]) -> None:
         """Store the current frame for the next simulation."""
         if self._pixels is not None and pixels is self._pixels:
             return
         self._directory.mkdir(exist_ok=True)
-        stored = self._directory / f"{self._n_stored}.ppm"
-        height, width = pixels.shape[:2]
-        stored.write_bytes(b"P6 %d %d 255\n" % (width, height) + np.ascontiguousarray(pixels).tobytes())
+        stored = self._directory / f"{self._n_stored}{self._write(self._directory / str(self._n_stored), pixels)}"
         self._remove_stored()
         self._n_stored += 1
         with self._lock:
             self._stored, self._number, self._pixels = stored, number, pixels
+
+    @staticmethod
+    def _write(stem: Path, pixels: NDArray[Any]) -> str:
+        """Write pixels to a file without compression; return the extension of its format."""
+        if pixels.dtype == np.uint8 and pixels.ndim == 3 and pixels.shape[2] == 3:
+            height, width = pixels.shape[:2]
+            stem.with_suffix(".ppm").write_bytes(
+                b"P6 %d %d 255\n" % (width, height) + np.ascontiguousarray(pixels).tobytes()
+            )
+            return ".ppm"
+        import tifffile
+
+        n_channels = (pixels.shape[2:] or (1,))[0]
+        tifffile.imwrite(
+            stem.with_suffix(".tif"),
+            pixels,
+            photometric="rgb" if n_channels > 2 else "minisblack",
+            planarconfig="contig" if n_channels > 1 else None,
+            extrasamples=["unassalpha"] if n_channels in (2, 4) else None,
+            metadata=None,
+        )
+        return ".tif"
 
     def _remove_stored(self) -> None:
         if self._stored is not None:
@@ -194,12 +220,30 @@ class Frames:
     @property
     def time_s(self) -> float:
         """Time of the current frame of a video, as in :func:`foveasim.config.run_video`."""
-        return self._number * self.frame_s
+        if self._video is None or self._number >= self._video.times_s.size:
+            return 0.0
+        return float(self._video.times_s[self._number])
 
     @property
     def frame_s(self) -> float:
-        """Frame period of a video; 0 for a camera, whose frames have no fixed times."""
-        return 0.0 if self._video is None else self._video.frame_s or DEFAULT_FRAME_S
+        """Frame period of a video, the mean one for other times; 0 for a camera, whose frames have no fixed times."""
+        if self._video is None:
+            return 0.0
+        times_s = self._video.times_s
+        return self._step_s or (float(times_s[-1]) / (times_s.size - 1) if times_s.size > 1 else DEFAULT_FRAME_S)
+
+    def times_message(self) -> dict[str, Any] | None:
+        """Return the times of a video whose frames are not at equal steps, or None if the page has them."""
+        is_irregular = self._video is not None and self._step_s is None and self._video.times_s.size > 1
+        times_s = self._video.times_s.tolist() if self._video is not None and is_irregular else None
+        if times_s == self._sent_s:
+            return None
+        self._sent_s = times_s
+        return {"kind": "film_times", "times_s": times_s}
+
+    def forget(self) -> None:
+        """Send the message again."""
+        self._sent_s = None
 
     def _is_used(self, settings: Mapping[str, Any]) -> bool:
         scene = settings.get("scene")

@@ -460,6 +460,7 @@ class Session:
         self.sweeps.send()
         self._structure = None
         self.gaze.forget()
+        self.frames.forget()
         if self.result is None:
             self.send({"kind": "busy"})
             self.compared.simulate_frozen(self.engine.simulate)
@@ -502,6 +503,9 @@ class Session:
         gaze_path = self.gaze.message(settings, None if result is None else result.shot)
         if gaze_path is not None:
             self.send(gaze_path)
+        film_times = self.frames.times_message()
+        if film_times is not None:
+            self.send(film_times)
         self.send({
             "kind": "state",
             "id": self._last_id,

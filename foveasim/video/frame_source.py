@@ -15,11 +15,14 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.calls import Limits
+from foveasim._core.calls import Limits, OwnCheck
 from foveasim._core.names import missing_path, possible_names
+from foveasim._core.validation import Floats, read_only
 from foveasim._io.images import PICTURE_EXTENSIONS, picture_names
+from foveasim._io.text_files import read_columns
 from foveasim._io.videos import VideoFile, frame_pixels
 from foveasim.errors import FileError, ParameterError, type_name
+from foveasim.modes.frame_times import FrameTimes, check_times
 from foveasim.scene import Scene
 from foveasim.sensor.limits import DURATION
 
@@ -29,6 +32,10 @@ __all__ = ["FrameSource", "list_pictures"]
 GREY_NM, COLOUR_NM = (550.0,), (620.0, 550.0, 450.0)
 #: Upper limit of frame indices.
 MAX_FRAMES = 2**31
+#: Column of files with the times of frames, and their size limit.
+TIMES_COLUMNS, MAX_TIMES_BYTES = ("t_s",), 1 << 28
+#: Rounding error of times at equal steps, as a fraction of the step.
+STEP_TOLERANCE = 1e-6
 FRAMES = Limits(at_least=0, at_most=MAX_FRAMES)
 
 
@@ -40,12 +47,15 @@ class FrameSource:
     ----------
     source : path, or iterable of paths or arrays
         A directory of pictures, in the natural order of their names (``frame 2`` before ``frame 10``); a video file, with the
-        extra ``video``; or pictures as :meth:`foveasim.Scene.from_picture` accepts them. If the source is an iterator, the
-        frames can be iterated only once.
+        extra ``video``, or an animated WebP file; or pictures as :meth:`foveasim.Scene.from_picture` accepts them. If the
+        source is an iterator, the frames can be iterated only once.
     start, stop, step : int
         Selection of frames, as in a slice.
     frame_s : float, optional, s
-        Frame period; by default that of the video file.
+        Frame period; by default the frames of a video file have its time stamps.
+    times_s : (n_frame,) float64, or path, optional, s
+        Times of the frames (of the selected ones) in strictly ascending order, instead of ``frame_s``; or a CSV file with the
+        column ``t_s``.
     template : Scene, optional
         Scene that specifies pitch or framing, distance and spectra of the frames; the pictures replace its basis images.
         Colours are converted to grey for a template with one basis image, and grey to colour for a template with three.
@@ -56,10 +66,18 @@ class FrameSource:
     Raises
     ------
     FileError
-        When the file is missing or a directory contains no pictures; during iteration when a frame is corrupt or of another
-        size.
+        When the file is missing or a directory contains no pictures; during iteration when a frame is corrupt, of another
+        size, or has a property that is not supported: interlaced frames, pixels that are not square, SMPTE ST 2084 (PQ), ...
     ParameterError
         When a value is out of range, a parameter of the scene is missing or unknown, or there are no frames.
+
+    Notes
+    -----
+    Frames of video files keep the depth of the file, and are turned as its display matrix specifies. By default their colours
+    are converted to sRGB by the matrix, range, transfer and primaries of the file: light is that of the scene, from which the
+    camera encoded it (inverse OETF of BT.709, BT.601, BT.2020 and hybrid log-gamma, whose peak is 1). Without these values, the
+    matrix is that of BT.601, as in FFmpeg and OpenCV, and the transfer that of pictures. With ``encoding``, transfer and
+    primaries of the file are ignored. The times of frames are those of the file from its first selected frame on.
 
     Examples
     --------
@@ -80,6 +98,7 @@ class FrameSource:
         stop: Annotated[int | None, FRAMES] = None,
         step: Annotated[int, Limits(at_least=1, at_most=MAX_FRAMES)] = 1,
         frame_s: Annotated[float | None, DURATION] = None,
+        times_s: OwnCheck[str | Path | ArrayLike | None] = None,
         template: Scene | None = None,
         **scene: Any,
     ) -> None:
@@ -96,7 +115,7 @@ class FrameSource:
         self._scene = scene
         self._source: Iterable[Any]
         self._n_source: int | None = None
-        period_s: float | None = None
+        self._n_skipped = 0
         if isinstance(source, str | Path):
             path = Path(source)
             if path.is_dir():
@@ -104,7 +123,7 @@ class FrameSource:
                 self._n_source = len(self._source)
             elif path.is_file():
                 self._source = VideoFile(path)
-                self._n_source, period_s = self._source.n_frames, self._source.frame_s
+                self._n_source = self._source.n_frames
             else:
                 raise FileError(path, missing_path(path, "file or directory"))
         elif isinstance(source, Iterable):
@@ -112,21 +131,65 @@ class FrameSource:
             self._n_source = len(source) if isinstance(source, Sized) else None
         else:
             raise ParameterError("source", f"must be a path or an iterable of pictures, got {type_name(source)}")
-        if frame_s is not None:
-            period_s = frame_s
-        self._frame_s = None if period_s is None else period_s * (self._step if frame_s is None else 1)
+        given_s = read_times(times_s) if isinstance(times_s, str | Path) else times_s
+        self._times = FrameTimes.of(frame_s, given_s)
         self._may_be_empty = False
         # The frame count of video files is an estimate.
         if self._n_source is not None and not isinstance(self._source, VideoFile):
             self._check_not_empty(self.n_frames)
+            if self._times is not None and self.n_frames is not None:
+                self._times.check_complete(self.n_frames)
 
     def __repr__(self) -> str:
         return f"FrameSource({self.n_frames or 'unknown number of'} frames)"
 
     @property
     def frame_s(self) -> float | None:
-        """Frame period in seconds; None if unknown."""
-        return self._frame_s
+        """
+        Frame period in seconds; None if it is unknown, or if the times of the frames are not at equal steps.
+
+        Raises
+        ------
+        FileError
+            When a video file is corrupt, or its frames have no time stamps.
+        """
+        if self._times is not None and self._times.frame_s is not None:
+            return self._times.frame_s
+        times_s = self._selected_times_s()
+        return None if times_s is None else equal_step_s(times_s)
+
+    @property
+    def times_s(self) -> Floats | None:
+        """
+        Times of the frames, (n_frames,) float64 s; None if they are unknown.
+
+        The first selected frame of a video file is at 0 s; those of :meth:`from_frame` keep their times. With ``frame_s``, None
+        if the number of frames is unknown.
+
+        Raises
+        ------
+        FileError
+            When a video file is corrupt, or its frames have no time stamps.
+        """
+        if self._times is not None and self._times.frame_s is not None:
+            n_frames = None if isinstance(self._source, VideoFile) else self.n_frames
+            if not n_frames:
+                return None
+            return read_only(np.asarray((self._n_skipped + np.arange(n_frames)) * self._times.frame_s, np.float64))
+        times_s = self._selected_times_s()
+        if times_s is None or self._n_skipped >= times_s.size:
+            return None
+        return read_only(times_s[self._n_skipped :])
+
+    def _selected_times_s(self) -> Floats | None:
+        """Return the given times or those of the video file, also of frames that :meth:`from_frame` skips."""
+        if self._times is not None:
+            return self._times.times_s
+        if not isinstance(self._source, VideoFile):
+            return None
+        first = self._start - self._n_skipped * self._step
+        selected_s = self._source.times_s[first : self._stop : self._step]
+        return np.asarray(selected_s - selected_s[0]) if selected_s.size else None
 
     @property
     def n_frames(self) -> int | None:
@@ -157,6 +220,7 @@ class FrameSource:
         """
         source = copy.copy(self)
         source._start += n * self._step  # noqa: SLF001 -- same class
+        source._n_skipped += n  # noqa: SLF001
         source._may_be_empty = True  # noqa: SLF001
         return source
 
@@ -172,11 +236,16 @@ class FrameSource:
         """Iterate over the scenes."""
         shape: tuple[int, ...] | None = None
         pictures: Iterator[Any] = islice(iter(self._source), self._start, self._stop, self._step)
+        settings = dict(self._scene)
         if isinstance(self._source, VideoFile):  # skipped frames are decoded but not converted to pixels
-            pictures = map(partial(frame_pixels, self._source.path), pictures)
+            is_srgb = settings.get("encoding", "auto") == "auto"
+            settings |= {"encoding": "srgb"} if is_srgb else {}
+            pictures = map(partial(frame_pixels, self._source.path, is_encoded=is_srgb), pictures)
         for k, picture in enumerate(pictures):
             scene = (
-                Scene.from_picture(picture, **self._scene) if self._template is None else self._from_template(picture)
+                Scene.from_picture(picture, **settings)
+                if self._template is None
+                else self._from_template(picture, self._template, settings)
             )
             if shape is not None and scene.basis.shape != shape:
                 where = (
@@ -192,9 +261,8 @@ class FrameSource:
             yield scene
         self._check_not_empty(0 if shape is None else None)
 
-    def _from_template(self, picture: Any) -> Scene:
-        template = self._template
-        assert template is not None
+    @staticmethod
+    def _from_template(picture: Any, template: Scene, settings: dict[str, Any]) -> Scene:
         n_basis = template.basis.shape[0]
         converted = Scene.from_picture(
             picture,
@@ -203,7 +271,7 @@ class FrameSource:
             # A single wavelength converts colours to grey. The template specifies the spectra.
             wavelength_nm=GREY_NM if n_basis == 1 else COLOUR_NM,
             band_width_nm=1.0,
-            **self._scene,
+            **settings,
         )
         basis = np.broadcast_to(converted.basis, (n_basis, *converted.basis.shape[1:]))
         # With a field of view, the pitch follows from the number of pixels of each frame.
@@ -217,6 +285,34 @@ def list_pictures(directory: Path) -> list[Path]:
     if not names:
         raise FileError(directory, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
     return [directory / name for name in names]
+
+
+def read_times(path: str | Path) -> Floats:
+    """
+    Read the times of frames from the column ``t_s`` of a CSV file, (n,) s.
+
+    Raises FileError when the file cannot be read, or is not such a table with strictly ascending times.
+    """
+    path = Path(path)
+    values = []
+    for number, (cell,) in read_columns(path, "a table of times", TIMES_COLUMNS, MAX_TIMES_BYTES):
+        try:
+            values.append(float(cell))
+        except ValueError:
+            raise FileError(path, f"must have a number in line {number}, got {cell[:60]}") from None
+    try:
+        return check_times(TIMES_COLUMNS[0], values)
+    except ParameterError as error:
+        raise FileError(path, str(error)) from None
+
+
+def equal_step_s(times_s: Floats) -> float | None:
+    """Return the step of times at equal steps, None for others or a single one."""
+    if times_s.size < 2:
+        return None
+    step_s = float(times_s[1] - times_s[0])
+    is_equal = np.all(np.abs(times_s - times_s[0] - step_s * np.arange(times_s.size)) <= STEP_TOLERANCE * step_s)
+    return step_s if is_equal else None
 
 
 def _check_settings(scene: dict[str, Any]) -> None:

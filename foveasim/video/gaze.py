@@ -18,9 +18,10 @@ from foveasim._core.validation import Floats, check_number, check_shape, finite_
 from foveasim._io.atomic import atomic_write
 from foveasim._io.text_files import read_columns
 from foveasim.camera import Camera
-from foveasim.camera._frames import PathPosition, path_digests, path_positions
+from foveasim.camera._frames import PathPosition, TimedFrames, carried_times, path_digests, path_positions
 from foveasim.errors import FileError, ParameterError, format_value
 from foveasim.fields import PowerMap
+from foveasim.modes.frame_times import FrameTimes
 from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.sensor.limits import DURATION
@@ -285,15 +286,17 @@ def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Sce
     >>> [gaze_um for _, gaze_um in fs.video.shift_sensor(scene, path)]
     [(0.0, 0.0), (5.0, 0.0)]
     """
-    return ((source, position_um) for position_um in path_positions(path.xy_um))
+    positions_um = path_positions(path.xy_um, path.t_s)
+    return TimedFrames(((source, position_um) for position_um in positions_um), FrameTimes(None, path.t_s))
 
 
 def follow_gaze(
     frames: Iterable[Scene | PowerMap],
     path: GazePath,
     *,
-    frame_s: Annotated[float, DURATION],
+    frame_s: Annotated[float | None, DURATION] = None,
     first_frame: Annotated[int, NOT_NEGATIVE] = 0,
+    times_s: ArrayLike | None = None,
 ) -> Iterator[tuple[Scene | PowerMap, tuple[float, float]]]:
     """
     Yield frames of a changing scene along a gaze path.
@@ -309,10 +312,18 @@ def follow_gaze(
         Frame period.
     first_frame : int
         Number of the first frame, whose gaze is that at ``first_frame * frame_s``.
+    times_s : (n_frame,) float64, s
+        Times of the frames on the axis of the path, instead of ``frame_s``; by default those that the frames carry.
 
     Yields
     ------
     light, (x_um, y_um)
+
+    Raises
+    ------
+    ParameterError
+        Immediately when the frames have no times, or both ``frame_s`` and ``times_s`` are given; during iteration when there is
+        not one time per frame.
 
     Examples
     --------
@@ -323,8 +334,23 @@ def follow_gaze(
     >>> [gaze_um for _, gaze_um in fs.video.follow_gaze(frames, path, frame_s=0.05)]
     [(0.0, 0.0), (5.0, 0.0), (10.0, 0.0)]
     """
-    for k, light in enumerate(frames, first_frame):
-        x_um, y_um = path.at(k * frame_s).tolist()
+    times = FrameTimes.of(frame_s, times_s, frames=frames) or carried_times(frames)
+    if times is None:
+        raise ParameterError("frame_s", "must be given, or 'times_s': the frames have no times")
+    if first_frame and times.times_s is not None:
+        raise ParameterError(
+            "first_frame", "must not be given with times of the frames, which say when they are", first_frame
+        )
+    return TimedFrames(_followed(frames, path, times, first_frame), times)
+
+
+def _followed(
+    frames: Iterable[Scene | PowerMap], path: GazePath, times: FrameTimes, first: int
+) -> Iterator[tuple[Scene | PowerMap, tuple[float, float]]]:
+    """Yield frames with the gaze at their times."""
+    for n, light in enumerate(frames, first):
+        times.check_number(n)
+        x_um, y_um = path.at(times.at_s(n)).tolist()
         yield light, (x_um, y_um)
 
 
@@ -384,7 +410,7 @@ def pan_camera(
         raise ParameterError(
             "scene", "must have a pixel pitch", hint="pass the camera instead of its optics, or camera.fit_scene(scene)"
         )
-    return _parts(scene, path, optics.grid(scene).pitch_x_um, n_y, n_x)
+    return TimedFrames(_parts(scene, path, optics.grid(scene).pitch_x_um, n_y, n_x), FrameTimes(None, path.t_s))
 
 
 def _crop(scene: Scene, left: int, bottom: int, n_y: int, n_x: int) -> Scene:
@@ -420,4 +446,4 @@ def _parts(
             at_um - (at - 0.5 * free) * cell_um
             for at_um, at, free in zip(position_um, (left, bottom), (free_x, free_y), strict=True)
         )
-        yield part, PathPosition((x_um, y_um), (position_um[0], position_um[1]), digests, k)
+        yield part, PathPosition((x_um, y_um), (position_um[0], position_um[1]), digests, k, t_s)

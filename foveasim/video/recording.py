@@ -37,7 +37,7 @@ __all__ = [
     "resume_recording",
 ]
 
-FORMAT, VERSION = "foveasim video", 2
+FORMAT, VERSION = "foveasim video", 3
 #: Codes per chunk of a zarr store, but at least one frame; one chunk is in memory while writing.
 CHUNK_CODES = 1 << 22
 #: Resumable recordings are written at this interval or earlier: upper limit of the loss after a crash.
@@ -47,14 +47,14 @@ CODECS = ("bytes", "zstd")
 MAX_DECOMPRESSED_BYTES = 8 * 2**30
 #: Arrays of the layout, and arrays that grow frame by frame: frame numbers are written last and mark complete frames.
 LAYOUT_ARRAYS = ("xy_um", "ring_offsets", "site_offsets")
-FRAME_ARRAYS = ("code", "exposure_s", "gaze_um", "next_path", "frame")
+FRAME_ARRAYS = ("code", "exposure_s", "gaze_um", "next_path", "time_s", "frame")
 #: Fill value of frame numbers, for incomplete frames.
 NO_FRAME = -1
 #: Digest of the rest of a gaze path where it ends, and in frames without a path.
 NO_PATH = bytes(DIGEST_BYTES).hex()
 #: Settings that may always differ between captures of one recording.
 FRAME_SETTINGS = frozenset(
-    {"exposure_s", "frame", "light.source", "place_um", "gaze_um", "gaze_path", "next_gaze_path"}
+    {"exposure_s", "frame", "time_s", "light.source", "place_um", "gaze_um", "gaze_path", "next_gaze_path"}
 )
 
 
@@ -77,6 +77,8 @@ class Recording:
     gaze_um : (n_frame, 2) float64, µm
         Gaze position at the first source frame of each capture, in the image of the complete picture; 0 for frames without
         positions.
+    times_s : (n_frame,) float64, s
+        Times of the first source frames of the captures; NaN where they are unknown.
     layout : Layout
         Layout of the photosites.
     filter_names : tuple of str
@@ -95,6 +97,7 @@ class Recording:
     exposure_s: Floats
     frame: NDArray[np.int64]
     gaze_um: Floats
+    times_s: Floats
     layout: Layout
     filter_names: tuple[str, ...]
     filter_of_site: NDArray[Any]
@@ -146,6 +149,7 @@ def read_recording(path: str | Path) -> Recording:
             exposure_s=group["exposure_s"][:],
             frame=group["frame"][:],
             gaze_um=group["gaze_um"][:],
+            times_s=group["time_s"][:],
             layout=Layout(
                 group["xy_um"][:], group["ring_offsets"][:], group["site_offsets"][:], columns, about["provenance"]
             ),
@@ -320,11 +324,12 @@ def _check_continuation(captures: Iterable[Capture], directory: Path, n_before: 
     differences mean that it is another recording.
     """
     first: dict[str, Any] | None = None
-    may_differ, next_frame = set(FRAME_SETTINGS), None
+    may_differ, next_frame, before_s = set(FRAME_SETTINGS), None, np.nan
     if n_before:
         with _open_checked(directory) as group:
             first, next_frame = group.attrs["settings"], int(group["frame"][n_before - 1]) + 1
             next_path = group["next_path"][n_before - 1].tobytes().hex()
+            before_s = float(group["time_s"][n_before - 1])
             may_differ |= set(group.attrs["varied"])
     for k, capture in enumerate(captures, n_before):
         settings = _json_round_trip(capture.settings)
@@ -343,6 +348,8 @@ def _check_continuation(captures: Iterable[Capture], directory: Path, n_before: 
             _reject(directory, different)
             if settings.get("gaze_path", NO_PATH) != next_path:
                 _reject(directory, ["gaze_path"])
+            if np.isnan(before_s) != ("time_s" not in settings) or settings.get("time_s", np.inf) <= before_s:
+                _reject(directory, ["time_s"])
         elif different:
             may_differ |= set(different)
             with _open_checked(directory, "r+") as group:
@@ -411,6 +418,7 @@ class _Frames:
                 settings.get("exposure_s", np.nan),
                 settings.get("gaze_um", (0.0, 0.0)),
                 np.frombuffer(bytes.fromhex(settings.get("next_gaze_path", NO_PATH)), np.uint8),
+                settings.get("time_s", np.nan),
                 settings.get("frame", n_before + len(frames)),
             )
         )
@@ -463,6 +471,7 @@ class _Frames:
             ("exposure_s", (0,), np.dtype(np.float64), 4096, 0.0),
             ("gaze_um", (0, 2), np.dtype(np.float64), 4096, 0.0),
             ("next_path", (0, DIGEST_BYTES), np.dtype(np.uint8), 4096, 0),
+            ("time_s", (0,), np.dtype(np.float64), 4096, np.nan),
             ("frame", (0,), np.dtype(np.int64), 4096, NO_FRAME),
         ):
             chunks = (n_chunk, *(max(n, 1) for n in shape[1:]))

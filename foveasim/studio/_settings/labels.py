@@ -217,6 +217,11 @@ WORDS: dict[str, Words] = {
         "spherical aberration", "Path difference of the spherical aberration at the edge of the aperture."
     ),
     "temperature_k": Words(help="Temperature of the sensor.", synonyms="cooling dark current"),
+    "times_s": Words(
+        "times of the frames",
+        help="Times of the frames of a video from a directory of pictures (foveasim video).",
+        synonyms="video time stamps variable frame rate vfr",
+    ),
     "to_nm": Words("cut-off wavelength"),
     "to_um": Words("new positions"),
     "qe.transmission": Words("silicon transmission"),

@@ -11,13 +11,14 @@ export class Film {
   // show(n, isFinal) shows a frame, and resolves to false when it failed; changed() is called when the state changes. settles:
   // whether a pause shows its frame again as the final one.
   /**
-   * @param {{ count: number, frameS?: number | null, isSkipping: boolean, n?: number, settles?: boolean,
+   * @param {{ count: number, frameS?: number | null, timesS?: number[] | null, isSkipping: boolean, n?: number, settles?: boolean,
    *   show: (n: number, isFinal: boolean) => Promise<boolean>, changed: () => void }} options
    */
-  constructor({ count, frameS, isSkipping, show, changed, n = 0, settles = false }) {
+  constructor({ count, frameS, timesS = null, isSkipping, show, changed, n = 0, settles = false }) {
     this.count = count;
     this.n = n;
     this.frameS = frameS || PICTURE_S;
+    this.timesS = timesS;
     this.isSkipping = isSkipping;
     this.settles = settles;
     this.show = show;
@@ -25,6 +26,19 @@ export class Film {
     this.isPlaying = false;
     this.isBusy = false;
     this.rate = new Rate();
+  }
+
+  // Time of a frame in s: at equal steps, or as the file specifies.
+  /** @param {number} n */
+  timeOf(n) { return this.timesS?.[n] ?? this.frameS * n; }
+
+  // The frame that is due at a time; not before the present one.
+  /** @param {number} t */
+  frameAt(t) {
+    if (!this.timesS) return Math.floor(t / this.frameS);
+    let n = this.n;
+    while (n + 1 < this.count && this.timeOf(n + 1) <= t) n++;
+    return n;
   }
 
   // The frame that is shown, or will be.
@@ -65,17 +79,17 @@ export class Film {
     this.rate = new Rate();
     this.changed();
     if (this.n >= this.count - 1) await this.go(0, false);
-    let start = performance.now() - 1000 * this.frameS * this.n;
+    let start = performance.now() - 1000 * this.timeOf(this.n);
     while (this.isPlaying && this.n < this.count - 1) {
-      const due = Math.floor((performance.now() - start) / (1000 * this.frameS));
+      const due = this.frameAt((performance.now() - start) / 1000);
       const next = this.isSkipping ? Math.max(due, this.n + 1) : this.n + 1;
-      const wait = start + 1000 * this.frameS * next - performance.now();
+      const wait = start + 1000 * this.timeOf(next) - performance.now();
       if (wait > 0) await new Promise((resolve) => { setTimeout(resolve, wait); });
       if (!this.isPlaying) break;
       const before = this.n;
       await this.go(next, false);
       // A step of the slider or a late picture: time continues from there.
-      if (this.n !== next || (!this.isSkipping && wait < 0)) start = performance.now() - 1000 * this.frameS * this.n;
+      if (this.n !== next || (!this.isSkipping && wait < 0)) start = performance.now() - 1000 * this.timeOf(this.n);
       if (this.n === before && !this.isBusy) break;
     }
     const wasPlaying = this.isPlaying;

@@ -35,7 +35,8 @@ export class GazePanel {
   /** @type {FilmRow} */ controls;
   /** @type {HTMLInputElement} */ chosen;
   /** @type {HTMLDialogElement} */ dialog;
-  pictureStep = 1; problem = ""; error = ""; filmKey = ""; isKnown = false; timer = 0;
+  /** @type {number[] | null} */ timesS = null;
+  pictureStep = 1; shortestStep = 1; problem = ""; error = ""; filmKey = ""; isKnown = false; timer = 0;
 
   // Callbacks: connection(), state(), playing() before the path plays, redraw() of the marks.
   /**
@@ -152,19 +153,19 @@ export class GazePanel {
   // -- state ----------------------------------------------------------------------------------------------------------------
 
   get isVideo() { return this.video !== null; }
-  // Time step in s: of the frames of a video, or of a replay over a picture.
-  get step() { return this.video?.frame_s || this.pictureStep; }
+  // Time step in s: of the frames of a video, the shortest one if they differ, or of a replay over a picture.
+  get step() { return this.isVideo && this.timesS ? this.shortestStep : this.video?.frame_s || this.pictureStep; }
   // Time of the first step of a replay; frames of a video begin at 0.
   get begin() { return this.isVideo ? 0 : Math.min(0, this.rows[0]?.[0] ?? 0); }
   // The present time of the path.
-  get time() { return this.isVideo ? (this.video?.n ?? 0) * this.step : this._timeOf(this.film?.n ?? 0); }
+  get time() { return this._timeOf((this.isVideo ? this.video : this.film)?.n ?? 0); }
   /** @returns {Point} */
   get position() { return this.on.state()?.settings.gaze_um || [0, 0]; }
   // Where the gaze is during a recording, before the server has answered.
   get recordedAt() { return this.recording?.position; }
 
   /** @param {number} n */
-  _timeOf(n) { return this.begin + n * this.step; }
+  _timeOf(n) { return (this.isVideo && this.timesS?.[n]) || this.begin + n * this.step; }
 
   open(isOpen = true) {
     if (!isOpen) {
@@ -174,6 +175,13 @@ export class GazePanel {
     this.row.hidden = !isOpen;
     if (!isOpen) this.table.root.hidden = true;
     this._show();
+  }
+
+  /** @param {number[] | null} timesS */
+  useTimes(timesS) {
+    this.timesS = timesS;
+    this.shortestStep = timesS ? timesS.slice(1).reduce((least, t, k) => Math.min(least, t - timesS[k]), Infinity) : 1;
+    this.filmKey = "";
   }
 
   /** @param {GazePathMessage} message */
@@ -207,8 +215,8 @@ export class GazePanel {
       const n = video ? video.n : clamp(before?.n ?? 0, 0, Math.max(0, count - 1));
       before?.pause();
       this.filmKey = key;
-      this.film = count ? new Film({ count, n, frameS: step, isSkipping: true, settles: true, changed: () => this._show(),
-        show: (k, isFinal) => this._follow(k, isFinal) }) : null;
+      this.film = count ? new Film({ count, n, frameS: step, timesS: video ? this.timesS : null, isSkipping: true, settles: true,
+        changed: () => this._show(), show: (k, isFinal) => this._follow(k, isFinal) }) : null;
     } else if (before && video && !before.isBusy) before.n = video.n;
   }
 
@@ -223,7 +231,11 @@ export class GazePanel {
   /** @param {number} t */
   _goTo(t) {
     this.film?.pause();
-    this.film?.go(Math.round((t - this.begin) / this.step), true);
+    const { film } = this;
+    let n = Math.round((t - this.begin) / this.step);
+    // The frame next to the time.
+    if (film?.timesS) n = film.timesS.reduce((best, at, k, all) => (Math.abs(at - t) < Math.abs(all[best] - t) ? k : best), 0);
+    film?.go(n, true);
   }
 
   // Sets the rows: one undo step.
@@ -238,7 +250,8 @@ export class GazePanel {
 
   start() {
     this.film?.pause();
-    this.recording = new Recording({ step: this.step, isVideo: this.isVideo, position: this.position });
+    this.recording = new Recording({ step: this.step, isVideo: this.isVideo, position: this.position,
+      timesS: this.isVideo ? this.timesS : null });
     this.timer = setInterval(() => this._show(), TICK_MS);
     speak(() => "recording the gaze");
     this._show();
@@ -294,7 +307,10 @@ export class GazePanel {
 
   _ask() {
     const duration = this.fields.find(({ name }) => name === "duration_s");
-    if (duration && this.video?.n_frames) duration.value = String(Number((this.video.n_frames * this.step).toPrecision(6)));
+    if (duration && this.video?.n_frames) {
+      const seconds = (this.timesS?.at(-1) ?? (this.video.n_frames - 1) * this.step) + this.step;
+      duration.value = String(Number(seconds.toPrecision(6)));
+    }
     this.dialog.showModal();
   }
 

@@ -29,8 +29,9 @@ export class Recording {
   nMoved = 0;
 
   // Over a picture the steps are those of the clock, and a rest between two movements is recorded too; over a video they are frames.
-  /** @param {{ step: number, isVideo: boolean, position: Point }} options */
-  constructor({ step, isVideo, position }) {
+  /** @param {{ step: number, isVideo: boolean, position: Point, timesS?: number[] | null }} options */
+  constructor({ step, isVideo, position, timesS = null }) {
+    this.timesS = timesS;
     this.step = step;
     this.isVideo = isVideo;
     this.position = position;
@@ -40,7 +41,7 @@ export class Recording {
   // Time since the start in s.
   get elapsed() { return (performance.now() - this.startedAt) / 1000; }
 
-  _add(k, [x, y]) { this.found.set(k, [k * this.step, x, y]); }
+  _add(k, [x, y]) { this.found.set(k, [this.timesS?.[k] ?? k * this.step, x, y]); }
 
   // The gaze has moved; frame: number of the frame of a video.
   /** @param {Point} position @param {number} frame */

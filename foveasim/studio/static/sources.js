@@ -23,6 +23,8 @@ export class Sources {
   /** @type {PictureFile[] | null} */ folder = null;
   /** @type {"video" | "camera" | "folder" | null} */ kind = null;
   /** @type {FilmAbout | null} */ about = null;
+  // Times of the frames of a video, if they are not at equal steps.
+  /** @type {number[] | null} */ timesS = null;
   /** @type {Rate} */ rate;
   // Elements.
   /** @type {{ [name: string]: HTMLButtonElement }} */ buttons;
@@ -138,7 +140,8 @@ export class Sources {
     if (film?.kind === "video") {
       if (this.kind !== "video" || this.shownName !== film.name || before?.count !== film.n_frames) {
         before?.pause();
-        this.film = new Film({ count: film.n_frames ?? 1, n: film.n, frameS: film.frame_s, isSkipping: true,
+        this.film = new Film({ count: film.n_frames ?? 1, n: film.n, frameS: film.frame_s, timesS: this.timesS,
+          isSkipping: true,
           show: (n) => this._shown(this.on.connection().send({ do: "frame", n })), changed: () => this._show() });
       } else if (!before.isBusy) before.n = film.n;
       this.shownName = film.name;

@@ -194,6 +194,7 @@ function receive(message, { isFailed }) {
   else if (kind === "error") { notice(message.text); views.made.sweep?.fail(message); }
   else if (kind === "text") awaited(files.receiveText(message));
   else if (kind === "gaze_path") gazePanel.usePath(message);
+  else if (kind === "film_times") { sources.timesS = message.times_s; gazePanel.useTimes(message.times_s); }
   else if (kind === "saved") notice("Saved as " + message.path);
   else if (kind === "sought") views.show("goal", true).then(() => views.made.goal?.show(message));
   else if (kind === "sweep") showSweep(message);
