@@ -198,7 +198,7 @@ def _video_stream(path: Path, container: Any) -> Any:
         )
     if streams[0].codec_context is None:  # some versions of PyAV crash on decoding
         raise FileError(path, "has a video stream with an unsupported codec")
-    aspect = streams[0].codec_context.sample_aspect_ratio
+    aspect = streams[0].sample_aspect_ratio
     if aspect and aspect != 1:
         raise FileError(
             path,

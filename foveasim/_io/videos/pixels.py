@@ -76,8 +76,9 @@ def _grey(frame: Any, bits: int, *, has_alpha: bool) -> NDArray[Any]:
     values = values.reshape(*values.shape[:2], -1)
     step = 1 << (bits - 8)
     grey = (values[..., 0].astype(np.float32) - 16 * step) / np.float32(219 * step)
-    channels = [_rounded(grey, bits)] + [_scaled(values[..., 1], bits)] * has_alpha
-    return np.stack(channels, axis=-1) if has_alpha else channels[0]
+    if has_alpha:
+        return np.stack([_rounded(grey, bits), _scaled(values[..., 1], bits)], axis=-1)
+    return _rounded(grey, bits)
 
 
 def _from_luma(path: Path, frame: Any, bits: int, *, has_alpha: bool) -> NDArray[Any]:
