@@ -78,7 +78,7 @@ class TimedFrames(Iterator[T]):
 
     @property
     def times_s(self) -> Floats | None:
-        """Times of the frames that have not been read, (n,) s; None at equal steps, or if all have been read."""
+        """Times of the frames to come, (n,) s; None at equal steps, or if there are none."""
         times_s = self._times.times_s
         return None if times_s is None or self._n_read >= times_s.size else times_s[self._n_read :]
 
@@ -90,7 +90,7 @@ class TimedFrames(Iterator[T]):
 
 def carried_times(frames: object) -> FrameTimes | None:
     """
-    Return the times that frames carry, as ``times_s`` or ``frame_s``; None if they have none.
+    Return the times that frames carry, as ``times_s`` or ``frame_s``; None without them.
 
     Raises FileError for a video file without time stamps.
     """
@@ -113,7 +113,7 @@ def path_digests(gaze_um: Floats) -> list[bytes]:
 
 
 def path_positions(gaze_um: Floats, times_s: Floats | None = None) -> Iterator[PathPosition]:
-    """Yield the points of a path, (n, 2) µm, as sensor positions; ``times_s``: their times, (n,) s."""
+    """Yield the points of a path, (n, 2) µm, at times (n,) s, as sensor positions."""
     digests = path_digests(gaze_um)
     for k, (x_um, y_um) in enumerate(gaze_um.tolist()):
         time_s = None if times_s is None else float(times_s[k])

@@ -76,7 +76,11 @@ def video(
 
 
 def _carried_times(frames: Iterable[Frame], *, is_required: bool) -> FrameTimes | None:
-    """Return the times that frames carry; without ``is_required`` None for a video file without time stamps."""
+    """
+    Return the times that frames carry.
+
+    Raises FileError for a video file without time stamps, if the times are required.
+    """
     try:
         return carried_times(frames)
     except FileError:

@@ -95,7 +95,7 @@ class Shot:
         Conditions on results, which :func:`foveasim.explore.check_requirements` checks.
     gaze_source : GazePath, Path or None
         Gaze path of videos, or its CSV file.
-    times_source : (n_frame,) float64 s, Path or None
+    times_source_s : (n_frame,) float64 s, Path or None
         Times of the frames of a video, or their CSV file.
     frame_encoding : str or None
         Encoding of the scene's picture, if it is specified; frames of a video have it too.
@@ -109,7 +109,7 @@ class Shot:
     seed: int
     requirements: tuple[Requirement, ...] = ()
     gaze_source: GazePath | Path | None = None
-    times_source: Floats | Path | None = None
+    times_source_s: Floats | Path | None = None
     frame_encoding: Encoding | None = None
 
     __repr__ = short_repr
@@ -122,7 +122,7 @@ class Shot:
     @cached_property
     def times_s(self) -> Floats | None:
         """Times of the frames of a video; a CSV file is read when they are first required."""
-        return read_times(self.times_source) if isinstance(self.times_source, Path) else self.times_source
+        return read_times(self.times_source_s) if isinstance(self.times_source_s, Path) else self.times_source_s
 
     @cached_property
     def exposure_s(self) -> float:
@@ -328,7 +328,7 @@ def build_shot(
         seed=streams.seed,
         requirements=tuple(_build(source, "requirements", settings.requirements or [])),
         gaze_source=_gaze_source(source, settings.gaze_path),
-        times_source=_times_source(source, settings.times_s),
+        times_source_s=_times_source(source, settings.times_s),
         frame_encoding=getattr(settings.scene, "encoding", None)
         if "encoding" in settings.scene.model_fields_set
         else None,

@@ -48,7 +48,7 @@ class FrameTimes:
         return cls(None, found)
 
     def after_s(self, number: int, first: int = 0) -> float:
-        """Return the time of a frame after that of an earlier one, in s; infinite after the last frame."""
+        """Return the time from one frame to a later one in s; infinite after the last frame."""
         if self.frame_s is not None:
             return (number - first) * self.frame_s
         assert self.times_s is not None
@@ -60,20 +60,22 @@ class FrameTimes:
 
     def last_before(self, time_s: float, first: int, rounding: float) -> int:
         """
-        Return how many frames after ``first`` the last one is that begins before a time; -1 if none does.
+        Return the last frame that begins before a time, counted from ``first``; -1 if none does.
 
         ``time_s``: after the frame ``first``. ``rounding``: tolerance as a fraction of the time between frames.
         """
         if self.frame_s is not None:
             return math.ceil(time_s / self.frame_s - rounding) - 1
         assert self.times_s is not None
-        later_s = self.times_s[first:] - self.times_s[first]
-        begins_s = later_s + rounding * np.diff(later_s, prepend=0.0)
-        return int(np.searchsorted(begins_s, time_s, "left")) - 1
+        end_s = self.times_s[first] + time_s
+        last = int(np.searchsorted(self.times_s, end_s, "left")) - 1
+        if last > first and end_s - self.times_s[last] <= rounding * (self.times_s[last] - self.times_s[last - 1]):
+            last -= 1
+        return last - first
 
     def of_frames(self, first: int, n: int) -> tuple[Floats, Floats]:
         """
-        Return the times (n + 1,) of frames and of the one after them, and the durations (n,), in s.
+        Return the times of frames and of the one after them, (n + 1,) s, and durations (n,) s.
 
         The last of given frames lasts as long as the one before it.
         """
@@ -104,7 +106,11 @@ class FrameTimes:
 
 
 def check_times(name: str, times_s: ArrayLike) -> Floats:
-    """Return times as an array (n,) s; raises ParameterError when they are not finite and strictly ascending."""
+    """
+    Return times as an array, (n,) s.
+
+    Raises ParameterError when they are not finite and strictly ascending.
+    """
     found = finite_array(name, times_s, ndim=1)
     if found.size == 0:
         raise ParameterError(name, "must be one or more times")

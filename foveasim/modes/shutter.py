@@ -134,7 +134,7 @@ class Shutter:
         return np.asarray((stop - start) / exposure_s)
 
     def last_frame(self, exposure_s: Annotated[float, EXPOSURE], first_frame: Annotated[int, NOT_NEGATIVE] = 0) -> int:
-        """Return the last frame that overlaps the exposure of any site, counted from ``first_frame``."""
+        """Return the last frame, from ``first_frame``, that overlaps the exposure of any site."""
         end_s = float(self.delay_s.max(initial=0.0)) + exposure_s
         last = self.times.last_before(end_s, first_frame, TIME_ROUNDING)
         is_last = self.times.after_s(first_frame + last + 1, first_frame) == math.inf
@@ -215,9 +215,10 @@ class Exposure:
 
 def _hat_integral(t_s: Floats, rise_s: float, fall_s: float) -> Floats:
     """
-    Return the integral up to a time of a function that rises linearly to 1 at 0 and falls to 0 after it.
+    Return the integral up to a time of a function that rises to 1 at 0, and then falls.
 
-    ``rise_s``: time before 0 at which it rises. ``fall_s``: time after 0 at which it is 0 again; infinite if it stays 1.
+    It is linear before and after. ``rise_s``: time before 0 at which it rises. ``fall_s``: time after 0 at which it is 0 again;
+    infinite if it stays 1.
     """
     rising = np.clip(t_s, -rise_s, 0.0)
     integral = 0.5 * (rise_s + rising) ** 2 / rise_s if rise_s else 0.0

@@ -226,14 +226,14 @@ class Frames:
 
     @property
     def frame_s(self) -> float:
-        """Frame period of a video, the mean one for other times; 0 for a camera, whose frames have no fixed times."""
+        """Frame period of a video, the mean one for other times; 0 for a camera."""
         if self._video is None:
             return 0.0
         times_s = self._video.times_s
         return self._step_s or (float(times_s[-1]) / (times_s.size - 1) if times_s.size > 1 else DEFAULT_FRAME_S)
 
     def times_message(self) -> dict[str, Any] | None:
-        """Return the times of a video whose frames are not at equal steps, or None if the page has them."""
+        """Return the times of frames at unequal steps, or None if the page has them."""
         is_irregular = self._video is not None and self._step_s is None and self._video.times_s.size > 1
         times_s = self._video.times_s.tolist() if self._video is not None and is_irregular else None
         if times_s == self._sent_s:

@@ -146,7 +146,7 @@ class FrameSource:
     @property
     def frame_s(self) -> float | None:
         """
-        Frame period in seconds; None if it is unknown, or if the times of the frames are not at equal steps.
+        Frame period in seconds; None if it is unknown, or if the steps are not equal.
 
         Raises
         ------
@@ -182,7 +182,7 @@ class FrameSource:
         return read_only(times_s[self._n_skipped :])
 
     def _selected_times_s(self) -> Floats | None:
-        """Return the given times or those of the video file, also of frames that :meth:`from_frame` skips."""
+        """Return given times or those of the file, also of frames before :meth:`from_frame`."""
         if self._times is not None:
             return self._times.times_s
         if not isinstance(self._source, VideoFile):

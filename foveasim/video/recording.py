@@ -77,8 +77,6 @@ class Recording:
     gaze_um : (n_frame, 2) float64, µm
         Gaze position at the first source frame of each capture, in the image of the complete picture; 0 for frames without
         positions.
-    times_s : (n_frame,) float64, s
-        Times of the first source frames of the captures; NaN where they are unknown.
     layout : Layout
         Layout of the photosites.
     filter_names : tuple of str
@@ -91,19 +89,21 @@ class Recording:
         White level per filter.
     settings : mapping
         Settings of the first frame.
+    times_s : (n_frame,) float64, s
+        Times of the first source frames of the captures; NaN where they are unknown.
     """
 
     code: Any
     exposure_s: Floats
     frame: NDArray[np.int64]
     gaze_um: Floats
-    times_s: Floats
     layout: Layout
     filter_names: tuple[str, ...]
     filter_of_site: NDArray[Any]
     bits: int
     white_dn: Floats
     settings: dict[str, Any]
+    times_s: Floats
 
     def __repr__(self) -> str:
         return f"Recording({self.n_frames} frames of {self.layout.n_sites} sites, {self.bits} bits)"

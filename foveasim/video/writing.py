@@ -1,4 +1,4 @@
-"""Writing of videos: zarr stores of all codes, picture sequences, and video files that play at the speed of the simulation."""
+"""Writing of videos: zarr stores of all codes, picture sequences, and video files."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def write_video(
     Notes
     -----
     Memory contains one chunk of codes or one frame, for any length of the video; in WebP all pictures. The target is created or
-    replaced after the last frame is written.
+    replaced after the last frame is written. In GIF and WebP, equal successive pictures are one.
 
     Times are rounded to the unit of the format without adding up: 10 ms in GIF, 1 ms in WebP, Matroska and WebM, 1/90,000
     s or finer in MP4. Colours are sRGB; video files specify their matrix, range, transfer and primaries.
@@ -217,19 +217,27 @@ class _Raster:
         return np.ascontiguousarray(np.broadcast_to(np.rint(colours), (*colours.shape[:2], 3)).astype(np.uint8))
 
 
-def _with_durations(captures: Iterable[Capture], frame_s: float | None) -> Iterator[tuple[Capture, float, float]]:
-    """Yield captures with the times at which they are shown and the durations, in s."""
+class _Shown(NamedTuple):
+    """A capture, when it is shown after the first one, and how long."""
+
+    capture: Capture
+    shown_s: float
+    duration_s: float
+
+
+def _with_durations(captures: Iterable[Capture], frame_s: float | None) -> Iterator[_Shown]:
+    """Yield captures with the times at which they are shown."""
     shown_s, duration_s = 0.0, frame_s or DEFAULT_FRAME_S
     before: Capture | None = None
     for capture in check_consistent(captures):
         if before is not None:
             if frame_s is None:
                 duration_s = _step_s(before, capture)
-            yield before, shown_s, duration_s
+            yield _Shown(before, shown_s, duration_s)
             shown_s += duration_s
         before = capture
     if before is not None:
-        yield before, shown_s, duration_s
+        yield _Shown(before, shown_s, duration_s)
 
 
 def _step_s(before: Capture, after: Capture) -> float:
@@ -264,9 +272,7 @@ def _write_pictures(captures: Iterable[Capture], target: Path, max_pixels: int) 
     return len(times_s)
 
 
-def _write_animation(
-    timed: Iterable[tuple[Capture, float, float]], target: Path, form: Animation, max_pixels: int
-) -> int:
+def _write_animation(timed: Iterable[_Shown], target: Path, form: Animation, max_pixels: int) -> int:
     from PIL import Image
 
     durations_ms: list[int] = []
@@ -322,9 +328,7 @@ def _frame_rate(frame_s: float) -> Fraction:
     return 1 / Fraction(frame_s).limit_denominator(1001)
 
 
-def _write_video_file(
-    timed: Iterable[tuple[Capture, float, float]], target: Path, frame_s: float | None, max_pixels: int
-) -> int:
+def _write_video_file(timed: Iterable[_Shown], target: Path, frame_s: float | None, max_pixels: int) -> int:
     av = import_optional(target, "av")
     codec = "libvpx-vp9" if target.suffix.lower() == ".webm" else "libx264"
     n_frames = 0
@@ -358,7 +362,7 @@ def _write_video_file(
 
 
 def _check_duration(name: str, duration_s: float) -> None:
-    """Reject frames that are too short for a video file; ``name``: the argument that they are from."""
+    """Reject frames that are too short for a video file; ``name``: their argument."""
     if duration_s < MIN_FILE_FRAME_S:
         rule = ">=" if name == "frame_s" else "apart by >="
         hint = "a .zarr store has any frame rate"

@@ -130,7 +130,7 @@ def public_objects(directory):
         reconstruct.SiteEstimates(light_e=MANY, variance_e2=MANY, is_saturated=MANY > 0.5),
         video.FrameSource([np.zeros((8, 8), np.uint8)] * 3, frame_s=0.1, pitch_um=50.0, distance_m=0.5, peak_radiance_w_m2_sr_nm=0.05, band_width_nm=10.0),
         video.GazePath(np.arange(100.0), np.zeros((100, 2))),
-        video.Recording(np.zeros((9, 1200)), MANY, np.arange(9), np.zeros((9, 2)), SITES, ("all",), np.zeros(1200, np.int64), 8, np.ones(1), {}),
+        video.Recording(np.zeros((9, 1200)), MANY, np.arange(9), np.zeros((9, 2)), SITES, ("all",), np.zeros(1200, np.int64), 8, np.ones(1), {}, np.full(9, np.nan)),
         modes.EventPixels(SENSOR), modes.Events(np.zeros(3), np.zeros(3, np.int32), np.ones(3, np.int8), SITES),
         modes.Shutter(SITES, 0.1), modes.Exposure(modes.Shutter(SITES, 0.1), 0.05), modes.SpikingPixels(SENSOR, threshold_e=np.full(SITES.n_sites, 100.0)),
         metrics.AliasingSpectrum(**SPECTRUM, wave_per_mm=MANY[:2], amplitude=np.ones((9, 9)), baseband_fraction=1.0, alias_fraction=0.0, alias_per_mm=MANY[:2], noise_fraction=0.0),

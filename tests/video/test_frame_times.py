@@ -149,7 +149,7 @@ def test_equal_times_are_a_frame_period(between):
         assert one.settings["time_s"] == other.settings["time_s"]
 
 
-def test_change_events_are_at_crossings_of_irregular_frames():
+def test_events_cross_thresholds_between_irregular_frames():
     sensor = fs.Sensor(fs.layout.grid(n_x=1, n_y=1, pitch_um=10.0))
     pixels = EventPixels(sensor, contrast_on=0.25, contrast_off=0.25, floor_e_per_s=0.0)
     log_rates = np.array([0.0, 0.6, 0.6, -1.0, 0.9, 0.4])

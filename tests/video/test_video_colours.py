@@ -290,7 +290,7 @@ def test_other_display_matrices_are_named(tmp_path):
     for elements in ((0.7, 0.7, -0.7, 0.7), (2, 0, 0, 2), (1, 0.5, 0, 1)):
         with pytest.raises(
             FileError,
-            match="a display matrix other than turns by 90 degrees and mirror images|pixels of the aspect ratio",
+            match=r"a display matrix other than turns by 90 degrees|pixels of the aspect ratio",
         ):
             list(VideoFile(with_matrix(tmp_path / "b.mp4", content, elements)).pixels())
 

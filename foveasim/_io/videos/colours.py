@@ -1,8 +1,8 @@
 """
-Colours of videos: matrix, range, transfer and primaries, by their numbers in ITU-T H.273.
+Colours of videos: matrix, range, transfer and primaries.
 
-Files without these values have them as FFmpeg and OpenCV assume: matrix of BT.601, limited range of luma and chroma, full range
-of grey and RGB, and pictures in sRGB.
+The numbers are those of ITU-T H.273. Files without these values have them as FFmpeg and OpenCV assume: matrix of BT.601,
+limited range of luma and chroma, full range of grey and RGB, and pictures in sRGB.
 """
 
 from __future__ import annotations

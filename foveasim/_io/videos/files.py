@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats
 from foveasim._io.images import check_picture_size
 from foveasim._io.sandbox import iterate_in_sandbox, read_in_sandbox
@@ -102,10 +102,10 @@ class VideoFile:
     @cached_property
     def times_s(self) -> Floats:
         """
-        Display times of the frames after the first one, (n_frame,) s, from the packets of the file, which are not decoded.
+        Display times of the frames after the first one, (n_frame,) s.
 
-        Time stamps that a constant rate explains to their resolution are those of this rate. Raises FileError when frames have
-        no or equal time stamps, or the file is corrupt.
+        They are read from the packets of the file, which are not decoded. Time stamps that a constant rate explains to their
+        resolution are those of this rate. Raises FileError when frames have no or equal time stamps, or the file is corrupt.
         """
         if self._animation is not None:
             return self._animation.times_s

@@ -33,10 +33,11 @@ def check_frame(path: Path, frame: Any) -> None:
 
 def pixels_of_frame(path: Path, frame: Any) -> NDArray[Any]:
     """
-    Return the pixels of a frame as stored, (n_y, n_x) or (n_y, n_x, n_channel), top row first.
+    Return the pixels of a frame as stored, top row first.
 
-    uint8 from 0 to 255, or uint16 from 0 to 65535 for more than 8 bits; 1 to 4 channels: grey, grey and alpha, colour, colour
-    and alpha. Raises FileError when the pixel format or the matrix of the colours is not supported.
+    (n_y, n_x) or (n_y, n_x, n_channel) uint8 from 0 to 255, or uint16 from 0 to 65535 for more than 8 bits; 1 to 4 channels:
+    grey, grey and alpha, colour, colour and alpha. Raises FileError when the pixel format or the matrix of the colours is not
+    supported.
     """
     form = frame.format
     bits = max((component.bits for component in form.components), default=0)
@@ -66,7 +67,7 @@ def _rgb(frame: Any, bits: int, *, has_alpha: bool) -> NDArray[Any]:
 
 
 def _grey(frame: Any, bits: int, *, has_alpha: bool) -> NDArray[Any]:
-    """Return the pixels of a grey frame, whose range is full unless the file specifies the limited one."""
+    """Return the pixels of a grey frame, of full range unless the file specifies another."""
     if bits < 8:  # black and white
         frame, bits = frame.reformat(format="gray"), 8
     dtype = np.dtype(np.uint8) if bits == 8 else np.dtype(">u2" if frame.format.is_big_endian else "<u2")
@@ -115,7 +116,7 @@ def _depth(bits: int) -> int:
 
 
 def _plane(frame: Any, number: int, dtype: np.dtype[Any], n_channels: int = 1) -> NDArray[Any]:
-    """Return the numbers of a plane, (n_y, n_x) or (n_y, n_x, n_channel), without the padding of its rows."""
+    """Return the numbers of a plane, (n_y, n_x[, n_channel]), without the padding of rows."""
     plane = frame.planes[number]
     rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height]
     used = np.ascontiguousarray(rows[:, : plane.width * n_channels * dtype.itemsize]).view(dtype)

@@ -60,7 +60,7 @@ class WebPAnimation:
 
 
 def _durations_s(path: Path) -> Floats:
-    """Return the durations of the frames, from the chunks ANMF of the file, which are not decoded."""
+    """Return the durations of the frames, from the chunks ANMF, without decoding."""
     n_bytes = path.stat().st_size
     found = []
     with path.open("rb") as file:
