@@ -18,12 +18,14 @@ from typer.testing import CliRunner
 from foveasim.capture import Capture
 from foveasim.cli import app
 from foveasim.errors import ParameterError
+from foveasim.scene import Scene
 from foveasim.studio._comparison import compare, fovea_um
 from foveasim.studio._engine import Engine
 from foveasim.studio._exports import notebook
 from foveasim.studio._frames import camera_frame
 from foveasim.studio._server import _exported, _message
 from foveasim.studio._settings.unknowns import with_n_sites
+from foveasim.video import FrameSource
 
 WIDTH, HEIGHT = 40, 24
 
@@ -82,6 +84,31 @@ def test_video_frames_are_exact(recorder, clip):
 
         assert state["film"]["n"] == n
         assert np.array_equal(codes(recorder), Engine(n_threads=1).simulate(picture).capture.code)
+
+
+@pytest.mark.slow
+def test_frames_have_time_stamps_and_depth(recorder, tmp_path):
+    times_s = [0.0, 0.1, 0.5, 0.6]
+    path = write_film(tmp_path / "a.mkv", [pixels(k) for k in range(4)], pixels="gbrp10le", times_s=times_s)
+    state = opened(recorder, path)
+    (sent,) = (message for message in recorder.messages if message["kind"] == "film_times")
+    np.testing.assert_allclose(sent["times_s"], times_s)
+    assert state["film"]["frame_s"] == pytest.approx(0.2)
+    rows = [[0.0, 0.0, 0.0], [1.0, 10.0, -5.0]]
+    recorder.do(do="set", key="gaze_path", value=rows, id=2)
+    state = recorder.do(do="frame", n=2, follows=True, id=3)
+
+    assert recorder.session.frames.time_s == pytest.approx(0.5)
+    assert state["settings"]["gaze_um"] == pytest.approx([5.0, -2.5])
+    assert recorder.session.frames._pixels.dtype == np.uint16
+    (frame,) = list(FrameSource(path, start=2, stop=3, pitch_um=1.0, distance_m=1.0, peak_radiance_w_m2_sr_nm=1.0))
+    stored = recorder.session.frames.stored_name
+    scene = Scene.from_picture(stored, pitch_um=1.0, distance_m=1.0, peak_radiance_w_m2_sr_nm=1.0)
+    assert np.array_equal(scene.basis, frame.basis)
+    recorder.messages.clear()
+    recorder.session.send_again()
+    recorder.do(do="frame", n=1, id=4)
+    assert any(message["kind"] == "film_times" for message in recorder.messages)
 
 
 @pytest.mark.slow

@@ -57,21 +57,9 @@ def pictures(n=6, shape=(32, 48)):
     return [np.full((*shape, 3), 20 + 200 * k // n, np.uint8) for k in range(n)]
 
 
-def film(path, times_s=TIMES_S, codec="ffv1", pixels="bgr0", tick=Fraction(1, 1000), start=0):
-    """Write a video file with time stamps in ticks, and return its path and the time stamps."""
-    av = pytest.importorskip("av")
-    stamps = [start + round(t / tick) for t in times_s]
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=25)
-        stream.height, stream.width = 32, 48
-        stream.pix_fmt = pixels
-        stream.codec_context.time_base = tick
-        for picture, stamp in zip(pictures(len(times_s)), stamps, strict=True):
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format=pixels)
-            frame.pts, frame.time_base = stamp, tick
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return path
+def film(path, times_s=TIMES_S, **options):
+    """Write a video file with time stamps, and return its path."""
+    return write_film(path, pictures(len(times_s)), times_s=times_s, **options)
 
 
 def stamps_of(path):
@@ -248,7 +236,7 @@ def test_frames_of_iterators_must_match_times():
     ],
 )
 def test_time_stamps_of_files_are_used(tmp_path, name, codec, pixels, tick):
-    path = film(tmp_path / name, codec=codec, pixels=pixels, tick=tick)
+    path = film(tmp_path / name, codec=codec, pixels=pixels, tick_s=tick)
     footage = FrameSource(path, **LIGHT)
     levels = [float(scene.basis.mean()) for scene in footage]
 
