@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import current_thread, main_thread
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO, cast
 
 import typer
 
@@ -602,6 +602,14 @@ def video(
     changes: Changes = None,
     frames_per_s: FramesPerS = None,
     line_s: Annotated[float, typer.Option("--line-s", help="Line time of a rolling shutter in seconds.")] = 0.0,
+    scan: Annotated[
+        str | None,
+        typer.Option(
+            "--scan",
+            help="What a rolling shutter reads first in the picture, instead of the layout's readout_order: rows_from_top, "
+            "rows_from_bottom, columns_from_left or columns_from_right.",
+        ),
+    ] = None,
     stop: Annotated[int | None, typer.Option("--stop", help="Maximum number of frames.")] = None,
     times: Annotated[
         Path | None,
@@ -636,6 +644,7 @@ def video(
             out,
             frame_s=frame_s,
             line_s=line_s,
+            scan=cast("Any", scan),
             stop=stop,
             gaze=gaze,
             n_threads=threads,

@@ -85,8 +85,8 @@ def main(out_dir: Path) -> None:
     out_dir.mkdir(parents=True, exist_ok=True)
     optics = fs.Optics(focal_length_mm=FOCAL_LENGTH_MM, f_number=2.8)
 
-    # %% A sensor read line by line, bottom line first, and one exposure with each shutter.
-    grid = readout_by(fs.layout.grid(n_x=N_LINES, n_y=N_LINES, pitch_um=PITCH_UM), "column")
+    # %% A sensor read row by row, from the top of the picture, and one exposure with each shutter.
+    grid = readout_by(fs.layout.grid(n_x=N_LINES, n_y=N_LINES, pitch_um=PITCH_UM))
     camera = fs.Camera(optics=optics, sensor=fs.Sensor(grid, bits=12, capacitance_f=5e-15, read_noise_e=3.0))
     times = {"exposure_s": EXPOSURE_S, "seed": 1, "frame_s": FRAME_S, "every": N_FRAMES}
     global_shutter = next(camera.video(frame_source(fan()), **times))
@@ -96,7 +96,7 @@ def main(out_dir: Path) -> None:
     # %% Skew of the bar per line.
     signal_e = np.maximum(skewed.expected_e.reshape(N_LINES, N_LINES) - 1.5 * np.median(skewed.expected_e), 0.0)
     centroid_um = signal_e @ grid.centroid_um[:N_LINES, 0] / signal_e.sum(axis=1)
-    skew_um = np.polyfit(np.arange(N_LINES), centroid_um, 1)[0]
+    skew_um = np.polyfit(np.arange(N_LINES)[::-1], centroid_um, 1)[0]
     cell_um = optics.magnification(DISTANCE_M) * SCENE_PITCH_UM
     expected_um = BAR_PX_PER_FRAME * cell_um / FRAME_S * LINE_S
     print(f"skew of the bar: {skew_um:.4f} µm per line; speed times line time: {expected_um:.4f} µm")

@@ -36,6 +36,7 @@ from foveasim.fields import Grid, PowerMap
 from foveasim.incidence import Incidence
 from foveasim.integrate import Integrator, outline_bounds_um
 from foveasim.layout.model import Layout
+from foveasim.layout.readout import Scan
 from foveasim.modes import Between
 from foveasim.optics import Optics
 from foveasim.reconstruct import Picture, reference
@@ -640,6 +641,7 @@ class Camera:
         line_s: float = 0.0,
         every: Annotated[int, Limits(at_least=1)] = 1,
         between: Between = "hold",
+        scan: Scan | None = None,
         ahead: Annotated[int, NOT_NEGATIVE] = 0,
         times_s: ArrayLike | None = None,
     ) -> Iterator[Capture]:
@@ -664,11 +666,14 @@ class Camera:
             Frame period. Without it and ``times_s`` each frame is exposed separately.
         line_s : float, s
             Line time of a rolling shutter: a site starts ``readout_order * line_s`` after the first. Requires times of the
-            frames.
+            frames. Layouts without this column are read row by row, from the top of the picture, as cameras are.
         every : int
             Number of frames per capture.
         between : {"hold", "linear"}
             Irradiance between frames: constant until the next frame, or interpolated linearly.
+        scan : {"rows_from_top", "rows_from_bottom", "columns_from_left", "columns_from_right"}, optional
+            Order of the rows or columns in the upright picture, instead of the column ``readout_order``: see
+            :class:`foveasim.modes.Shutter`.
         ahead : int
             Number of frames to compute in advance, each in one thread. This can be faster than one frame in all threads for
             frames that are slow to read, or with many cores; on two cores it is slower. Only for frames that do not depend on
@@ -686,7 +691,8 @@ class Camera:
         Warns
         -----
         FoveasimWarning
-            When an exposure is longer than the time to the start of the next one.
+            When an exposure is longer than the time to the start of the next one, or the shutter is rolling, the layout has no
+            column ``readout_order``, and no ``scan`` is specified.
 
         Notes
         -----
@@ -720,6 +726,7 @@ class Camera:
             line_s=line_s,
             every=every,
             between=between,
+            scan=scan,
             ahead=ahead,
             times_s=times_s,
         )

@@ -21,6 +21,7 @@ from foveasim.camera._rates import expected_rates
 from foveasim.camera._steps import capture_for_time, capture_rates, check_exposure, seconds_of
 from foveasim.capture import Capture
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, warn
+from foveasim.layout.readout import Scan
 from foveasim.modes import Between, Exposure, Shutter
 from foveasim.modes.frame_times import FrameTimes
 from foveasim.sensor.limits import EXPOSURE
@@ -42,6 +43,7 @@ def video(
     line_s: float,
     every: int,
     between: Between,
+    scan: Scan | None,
     ahead: int,
     times_s: ArrayLike | None,
 ) -> Iterator[Capture]:
@@ -54,6 +56,8 @@ def video(
             raise ParameterError("exposure_s", "must be one time, or a sequence of times", exposure_s, "s")
         exposures = exposures_s.reshape(-1).tolist()
     check_frames(frames)
+    if scan is not None and not line_s:
+        raise ParameterError("scan", "requires 'line_s', the line time of a rolling shutter", scan)
     times = FrameTimes.of(frame_s, times_s, frames=frames)
     is_integrated = times is not None or bool(line_s) or between != "hold" or every != 1
     if times is None:
@@ -63,7 +67,7 @@ def video(
     if times is None:
         name = "line_s" if line_s else "between" if between != "hold" else "every"
         raise ParameterError(name, "requires 'frame_s', the frame period, or 'times_s', the times of the frames")
-    shutter = Shutter(camera.layout, times.frame_s, line_s, between, times.times_s)
+    shutter = Shutter(camera.layout, times.frame_s, line_s, between, scan, times.times_s)
     longest_s = max((time_s for time_s in exposures if isinstance(time_s, float)), default=0.0)
     shortest_s = times.shortest_s(every)
     if longest_s > (1.0 + TIME_ROUNDING) * shortest_s:
@@ -136,6 +140,7 @@ def _rolling(
         "line_s": shutter.line_s,
         "every": every,
         "between": shutter.between,
+        "scan": shutter.scan,
         **auto,
     }
     # Frames at equal steps continue those before the first one.

@@ -18,6 +18,7 @@ from foveasim.capture import Capture
 from foveasim.config._objects import Shot
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
+from foveasim.layout.readout import Scan
 from foveasim.scene import Scene
 from foveasim.video import FrameSource, GazePath, count_recorded_frames, follow_gaze, write_video
 from foveasim.video.frame_source import list_pictures
@@ -34,6 +35,7 @@ def run_video(
     *,
     frame_s: float | None = None,
     line_s: float = 0.0,
+    scan: Scan | None = None,
     stop: int | None = None,
     gaze: str | Path | None = None,
     n_threads: int | None = None,
@@ -55,6 +57,8 @@ def run_video(
         Frame period; by default the frames have the times of the shot (``times_s``) or the time stamps of the video file.
     line_s : float, s
         Line time of a rolling shutter.
+    scan : str, optional
+        Order of its rows or columns: :meth:`foveasim.Camera.video`.
     stop : int, optional
         Maximum number of frames.
     gaze : path, optional
@@ -115,6 +119,7 @@ def run_video(
             first_frame=n_before,
             frame_s=step_s if line_s else None,
             line_s=line_s,
+            scan=scan,
             ahead=thread_count(n_threads),
         )
     return write_video(
@@ -123,7 +128,7 @@ def run_video(
         n_frames=source.n_frames,
         progress=progress,
         resume=is_store,
-        plan=_plan(shot, shot.scene, Path(frames), source, line_s, stop, path) if is_store else None,
+        plan=_plan(shot, shot.scene, Path(frames), source, line_s, scan, stop, path) if is_store else None,
     )
 
 
@@ -133,6 +138,7 @@ def _plan(
     frames: Path,
     source: FrameSource,
     line_s: float,
+    scan: Scan | None,
     stop: int | None,
     path: GazePath | None,
 ) -> dict[str, Any]:
@@ -152,7 +158,7 @@ def _plan(
         "seed": shot.seed,
         "frames": hashlib.sha256(json.dumps(files).encode()).hexdigest(),
         "encoding": shot.frame_encoding,
-        "shutter": {"frame_s": source.frame_s, "line_s": line_s} if line_s else None,
+        "shutter": {"frame_s": source.frame_s, "line_s": line_s, "scan": scan} if line_s else None,
         "times_s": None if source.frame_s is not None else to_plain_data(source.times_s),
         "stop": stop,
         "gaze": {"gaze_um": camera.gaze_um, "axis": camera.axis, "path": None if path is None else to_plain_data(path)},

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.calls import NOT_NEGATIVE, Limits
 from foveasim._core.names import CHANNEL_LETTERS, COLOURS, did_you_mean, list_names
 from foveasim._core.random_streams import Streams
-from foveasim._core.validation import Ints, finite_array, freeze
+from foveasim._core.validation import finite_array, freeze
 from foveasim.errors import ParameterError
+from foveasim.layout._rows import lattice_index, site_rows
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.model import Layout, derived
@@ -23,8 +24,6 @@ __all__ = ["MOSAICS", "graph_colouring", "mosaic", "random_channels"]
 
 #: Pairs of columns that index the sites in two directions, in order of preference.
 INDEX_COLUMNS = (("row", "column"), ("ring", "sector"))
-#: Largest displacement of a site from its position on a lattice, as a fraction of the pitch.
-LATTICE_TOLERANCE = 0.05
 #: Smallest fraction of occupied positions: that of a disc is 0.79, that of staggered rows 0.5.
 MIN_LATTICE_FRACTION = 2 / 3
 #: Smallest side of a block that a string of letters describes.
@@ -56,8 +55,8 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
         of a GDSII file. Row 0 of a lattice is the lowest, column 0 the leftmost.
     block : str or sequence of str
         Name in :data:`MOSAICS`; or rows of letters, one letter per site: ``("RG", "GB")`` is a Bayer block with red at row
-        0, column 0, and row 0 is the lowest; or the letters of a square block in reading order, from the top left, such as
-        ``"RGGB"``, ``"RCCB"``, or 16 letters.
+        0, column 0, and row 0 is the lowest; or the letters of a square block in reading order, such as
+        ``"RGGB"``, ``"RCCB"``, or 16 letters: as in cameras, the first one is the filter at the top left of the layout.
     names : str, optional
         Letters in the order of the sensor's filters: the ``channel`` of a site is the index of its letter. "RGB" by
         default, "RGBW" for a block of these letters with a W; otherwise the letters of the block, R, G, B and W first, then
@@ -77,6 +76,7 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     >>> mosaic(grid(n_x=4, n_y=2, pitch_um=2.0), "BGGR").channel.reshape(2, 4)[::-1].tolist()
     [[2, 1, 2, 1], [1, 0, 1, 0]]
     """
+    is_from_top = isinstance(block, str) and block not in MOSAICS
     if isinstance(block, str):
         block = _named_block(block)
     rows = list(block) if isinstance(block, Sequence) else []
@@ -99,6 +99,10 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
         raise ParameterError("block", f"must use the letters {names!r}, got {', '.join(map(repr, unknown))}")
     channels = np.array([[names.index(letter) for letter in row] for row in rows], np.int16)
     row, column = _indices(layout)
+    from_low, from_left = (site_rows(layout, axis) if is_from_top else None for axis in (1, 0))
+    if from_low is not None and from_left is not None:  # the last row of the block is the top one
+        row = np.subtract(from_low, (int(from_low.max(initial=0)) + 1) % len(rows), dtype=np.int32)
+        column = from_left
     n_rows, n_columns = (np.array(n, np.uint16) for n in channels.shape)
     position = (row % n_rows).astype(np.int32)
     position *= n_columns
@@ -139,7 +143,7 @@ def _indices(layout: Layout) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
     pair = next((pair for pair in INDEX_COLUMNS if all(name in layout.columns for name in pair)), None)
     if pair is not None:
         return layout._checked_indices(pair[0]), layout._checked_indices(pair[1])  # noqa: SLF001
-    row, column = (_lattice_index(layout, axis) if layout.n_sites else None for axis in (1, 0))
+    row, column = (lattice_index(layout, axis) if layout.n_sites else None for axis in (1, 0))
     if row is not None and column is not None:
         n_x = int(column.max()) + 1
         n_positions = n_x * (int(row.max()) + 1)
@@ -151,19 +155,6 @@ def _indices(layout: Layout) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
         f"got {sorted(layout.columns)}",
         hint="add them with with_columns(row=..., column=...), or the filters with with_columns(channel=...)",
     )
-
-
-def _lattice_index(layout: Layout, axis: int) -> Ints | None:
-    """Return the indices of sites along an axis, or None where the pitch is not constant."""
-    position_um, bounds_um = layout.centroid_um[:, axis], layout.site_bounds_um
-    side_um = float((bounds_um[:, axis + 2] - bounds_um[:, axis]).min(initial=np.inf))
-    order = np.argsort(position_um)
-    index = np.zeros(order.size, np.int64)
-    index[order[1:]] = np.cumsum(np.diff(position_um[order]) > 0.5 * side_um)
-    mean_um = np.bincount(index, position_um) / np.bincount(index)
-    pitch_um = (mean_um[-1] - mean_um[0]) / (mean_um.size - 1) if mean_um.size > 1 else side_um
-    is_regular = np.abs(position_um - mean_um[0] - index * pitch_um) <= LATTICE_TOLERANCE * pitch_um
-    return index if is_regular.all() else None
 
 
 @layout_edit(example={"fractions": [1.0, 2.0, 1.0], "seed": 0})

@@ -1,34 +1,53 @@
-"""Readout lines of photosites, and the readout order along each line."""
+"""
+Readout lines of photosites, and the order in which their exposures begin and end.
+
+The top is that of the upright picture, the highest y: the optical image is inverted, so that this edge of the sensor is the
+lower one in a camera that is held upright.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import shapely
 
 from foveasim._core.rings import positions_in_runs
+from foveasim._core.validation import Floats, Ints
 from foveasim.errors import ParameterError
+from foveasim.layout._rows import POSITION_COLUMNS, site_rows
+from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.model import Layout
 
-__all__ = ["nearest_bus", "readout_by", "readout_order"]
+__all__ = ["Scan", "nearest_bus", "readout_by", "readout_order", "scan_index"]
+
+#: Order of the rows or columns of a sensor, in the upright picture.
+Scan = Literal["rows_from_top", "rows_from_bottom", "columns_from_left", "columns_from_right"]
 
 
-def readout_by(layout: Layout, column: str) -> Layout:
+@layout_edit(example={"scan": "rows_from_top"})
+def readout_by(layout: Layout, column: str | None = None, *, scan: Scan = "rows_from_top") -> Layout:
     """
-    Assign readout lines by a column: ``column``, ``row``, ``sector`` or ``ring``.
+    Assign readout lines by a column, and the order in which a rolling shutter reads the sites.
 
     Parameters
     ----------
     layout : Layout
-    column : str
-        Name of a column of integers >= 0, the indices of the lines.
+    column : str, optional
+        Name of a column of integers >= 0, the indices of the lines that share a readout circuit: ``column``, ``row``,
+        ``sector`` or ``ring``. By default ``column`` for a scan of rows and ``row`` for a scan of columns; without it, the
+        lines do not change.
+    scan : {"rows_from_top", "rows_from_bottom", "columns_from_left", "columns_from_right"}
+        What is read first, in the upright picture: y points up. Cameras read the top row first.
 
     Returns
     -------
     Layout
-        With the columns ``readout_line`` and ``readout_order`` (see :func:`readout_order`).
+        With the columns ``readout_line`` and ``readout_order``. If the layout has rows (or columns), the order is their
+        number in the scan: all sites of a row are read at once. Otherwise the order is that of the sites on each line of
+        the given ``column`` (:func:`readout_order`), or that of strips with the mean distance of sites as their width.
 
     Raises
     ------
@@ -38,13 +57,48 @@ def readout_by(layout: Layout, column: str) -> Layout:
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.layout.readout_by(fs.layout.grid(n_x=3, n_y=2, pitch_um=2.0), "row").readout_line.tolist()
-    [0, 0, 0, 1, 1, 1]
+    >>> layout = fs.layout.readout_by(fs.layout.grid(n_x=3, n_y=2, pitch_um=2.0))  # row 0 is the lowest
+    >>> layout.readout_line.tolist(), layout.columns["readout_order"].tolist()
+    ([0, 1, 2, 0, 1, 2], [1, 1, 1, 0, 0, 0])
     """
-    return readout_order(layout.with_columns(readout_line=layout.index_column(column)))
+    axis = _axis(scan)
+    across = POSITION_COLUMNS[1 - axis]
+    lines = column if column is not None else across if across in layout.columns else None
+    if lines is not None:
+        layout = layout.with_columns(readout_line=layout.index_column(lines))
+    if column not in (None, *POSITION_COLUMNS) or (column is not None and site_rows(layout, axis) is None):
+        return readout_order(layout, scan=scan)
+    return layout.with_columns(readout_order=scan_index(layout, scan))
 
 
-def nearest_bus(layout: Layout, buses: Sequence[Any]) -> Layout:
+def scan_index(layout: Layout, scan: Scan) -> Ints:
+    """
+    Return the number of the row or column of each site in a scan, (n_site,), from 0.
+
+    Without rows and columns, these are strips with the mean distance of sites as their width.
+    """
+    axis = _axis(scan)
+    rows = site_rows(layout, axis)
+    index = None if rows is None else rows.astype(np.int64)
+    if index is None:
+        low_um, high_um = _bounds(layout)
+        pitch_um = math.sqrt(float(np.prod(high_um - low_um)) / layout.n_sites)
+        index = np.floor((layout.centroid_um[:, axis] - low_um[axis]) / pitch_um).astype(np.int64)
+    if scan in ("rows_from_top", "columns_from_right"):
+        index = -index
+    return np.asarray(index - index.min(initial=np.iinfo(np.int64).max), np.int64)
+
+
+def _bounds(layout: Layout) -> tuple[Floats, Floats]:
+    bounds_um = layout.site_bounds_um
+    return bounds_um[:, :2].min(axis=0), bounds_um[:, 2:].max(axis=0)
+
+
+def _axis(scan: Scan) -> int:
+    return 1 if scan.startswith("rows") else 0
+
+
+def nearest_bus(layout: Layout, buses: Sequence[Any], *, scan: Scan = "rows_from_top") -> Layout:
     """
     Assign each site to the readout bus nearest to its centroid.
 
@@ -53,11 +107,13 @@ def nearest_bus(layout: Layout, buses: Sequence[Any]) -> Layout:
     layout : Layout
     buses : sequence of shapely geometries, µm
         Usually LineStrings; bus k is readout line k. At equal distances the first bus is taken.
+    scan : str
+        Order of the sites of each bus: :func:`readout_order`.
 
     Returns
     -------
     Layout
-        With the columns ``readout_line`` and ``readout_order``.
+        With the columns ``readout_line`` and ``readout_order``: a bus reads its sites one after the other.
 
     Raises
     ------
@@ -79,31 +135,38 @@ def nearest_bus(layout: Layout, buses: Sequence[Any]) -> Layout:
     site, bus = shapely.STRtree(lines).query_nearest(shapely.points(layout.centroid_um))
     nearest = np.full(layout.n_sites, len(lines), np.int64)
     np.minimum.at(nearest, site, bus)
-    return readout_order(layout.with_columns(readout_line=nearest))
+    return readout_order(layout.with_columns(readout_line=nearest), scan=scan)
 
 
-def readout_order(layout: Layout) -> Layout:
+def readout_order(layout: Layout, *, scan: Scan = "rows_from_top") -> Layout:
     """
-    Order the sites of each readout line by y, and by x where y is equal.
+    Order the sites of each readout line, the highest first by default.
 
     Parameters
     ----------
     layout : Layout
+    scan : {"rows_from_top", "rows_from_bottom", "columns_from_left", "columns_from_right"}
+        Which site of a line is read first, in the upright picture. At equal heights it is the leftmost one, in equal columns
+        the highest.
 
     Returns
     -------
     Layout
-        With the column ``readout_order``, counted from 0 in each ``readout_line``: lines are read in parallel.
+        With the column ``readout_order``, counted from 0 in each ``readout_line``: lines are read in parallel, and each line
+        reads one site at a time.
 
     Examples
     --------
     >>> import foveasim as fs
-    >>> layout = fs.layout.readout_by(fs.layout.grid(n_x=3, n_y=2, pitch_um=2.0), "column")
+    >>> layout = fs.layout.grid(n_x=3, n_y=2, pitch_um=2.0)  # a line is a column
     >>> fs.layout.readout_order(layout).columns["readout_order"].tolist()
-    [0, 0, 0, 1, 1, 1]
+    [1, 1, 1, 0, 0, 0]
     """
-    line = layout.readout_line
-    order = np.lexsort((layout.centroid_um[:, 0], layout.centroid_um[:, 1], line))
+    line, (x_um, y_um) = layout.readout_line, layout.centroid_um.T
+    keys = (x_um, y_um if scan == "rows_from_bottom" else -y_um)
+    if _axis(scan) == 0:
+        keys = (-y_um, x_um if scan == "columns_from_left" else -x_um)
+    order = np.lexsort((*keys, line))
     counts = np.bincount(line) if line.size else np.zeros(0, np.int64)
     position = np.empty(layout.n_sites, np.int64)
     position[order] = positions_in_runs(counts)

@@ -1,8 +1,8 @@
 """
 Rolling shutters: overlap of the exposure of each photosite with the frames of a scene.
 
-The exposure of a site begins ``readout_order * line_s`` after the first. Irradiance is given in frames, ``frame_s`` apart or at
-``times_s``: it is constant until the next frame, or interpolated linearly between frames.
+The exposure of a site begins ``readout_order * line_s`` after the first, or with its row. Irradiance is given in frames,
+``frame_s`` apart or at ``times_s``: it is constant until the next frame, or interpolated linearly between frames.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ import numpy as np
 
 from foveasim._core.calls import NOT_NEGATIVE, check_declared
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, check_per_site, finite_array
-from foveasim.errors import ParameterError, SimulationError
+from foveasim._core.threads import cached_property
+from foveasim._core.validation import Floats, check_per_site, finite_array, read_only
+from foveasim.errors import FoveasimWarning, ParameterError, warn
 from foveasim.layout.model import Layout
+from foveasim.layout.readout import Scan, scan_index
 from foveasim.modes.frame_times import FrameTimes
 from foveasim.sensor.limits import DURATION, EXPOSURE
 
@@ -25,6 +27,8 @@ __all__ = ["Between", "Exposure", "Shutter"]
 
 #: Irradiance between frames: constant until the next frame, or linear interpolation.
 Between = Literal["hold", "linear"]
+#: Scan of layouts without the column ``readout_order``: that of cameras.
+DEFAULT_SCAN: Scan = "rows_from_top"
 #: Rounding tolerance in frames: an exposure that ends less than this after a frame is regarded as ending with the frame.
 TIME_ROUNDING = 1e-9
 
@@ -37,13 +41,16 @@ class Shutter:
     Parameters
     ----------
     layout : Layout
-        Layout of the photosites, with the column ``readout_order`` if ``line_s`` is not 0.
+        Layout of the photosites; its column ``readout_order`` is the line time at which each exposure begins.
     frame_s : float, s
         Frame period of the scene.
     line_s : float, s
         Line time, between the starts of exposure of successive lines; 0 for a global shutter.
     between : {"hold", "linear"}
         Irradiance between frames: constant until the next frame, or linear interpolation.
+    scan : {"rows_from_top", "rows_from_bottom", "columns_from_left", "columns_from_right"}, optional
+        Order of the rows or columns in the upright picture, as in :func:`foveasim.layout.readout_by`, instead of the column
+        ``readout_order``. Rows from the top, as in cameras, for layouts without this column.
     times_s : (n_frame,) float64, s
         Times of the frames in strictly ascending order, instead of ``frame_s``. After the last one irradiance is constant.
 
@@ -51,8 +58,11 @@ class Shutter:
     ------
     ParameterError
         When not exactly one of ``frame_s`` and ``times_s`` is given, or the times are not ascending.
-    SimulationError
-        When ``line_s`` is not 0 and the layout has no column ``readout_order``.
+
+    Warns
+    -----
+    FoveasimWarning
+        When ``line_s`` is not 0, the layout has no column ``readout_order``, and no scan is specified.
 
     Examples
     --------
@@ -75,6 +85,7 @@ class Shutter:
     frame_s: Annotated[float | None, DURATION] = None
     line_s: Annotated[float, EXPOSURE] = 0.0
     between: Between = "hold"
+    scan: Scan | None = None
     times_s: Floats | None = None
     times: FrameTimes = field(init=False, repr=False)
 
@@ -87,21 +98,28 @@ class Shutter:
             raise ParameterError("frame_s", "must be given, or 'times_s'")
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "times_s", times.times_s)
-        if self.line_s and "readout_order" not in self.layout.columns:
-            raise SimulationError(
-                "a rolling shutter needs the line of each site; add a column 'readout_order' to the layout, for example with "
-                "foveasim.layout.readout_by or nearest_bus"
-            )
-        if self.line_s:
+        if not self.line_s or self.scan is not None:
+            return
+        if "readout_order" in self.layout.columns:
             finite_array("readout_order", self.layout.columns["readout_order"])
+            return
+        object.__setattr__(self, "scan", DEFAULT_SCAN)
+        if self.layout.n_sites:
+            n_rows = int(scan_index(self.layout, DEFAULT_SCAN).max()) + 1
+            warn(
+                f"the rolling shutter reads {n_rows:,} rows from the top of the picture, because the layout has no column "
+                "'readout_order'; pass scan='rows_from_top' or another order, or use foveasim.layout.readout_by",
+                FoveasimWarning,
+            )
 
-    @property
+    @cached_property
     def delay_s(self) -> Floats:
         """Start of the exposure of each site after the first line, (n_site,) s; (1,) if global."""
         if not self.line_s:
-            return np.zeros(1)
-        order = np.asarray(self.layout.columns["readout_order"], np.float64)
-        return self.line_s * (order - order.min(initial=np.inf))
+            return read_only(np.zeros(1))
+        order = self.layout.columns["readout_order"] if self.scan is None else scan_index(self.layout, self.scan)
+        order = np.asarray(order, np.float64)
+        return read_only(self.line_s * (order - order.min(initial=np.inf)))
 
     def overlap_fraction(
         self,

@@ -47,6 +47,18 @@ def test_letters_are_read_from_top_left(letters, names, top):
     assert np.array_equal(channel, np.tile(channel[:2, :2], (6, 6)))
 
 
+def test_first_letter_is_filter_at_top_left():
+    odd = fs.layout.grid(n_x=5, n_y=5, pitch_um=2.0)
+    top_first = odd.with_columns(row=4 - odd.columns["row"])
+    bare = fs.Layout.from_polygons(odd.polygons())
+    cropped = odd[(odd.columns["row"] > 0) & (odd.columns["column"] > 0)]
+
+    for layout in (odd, top_first, bare):
+        channel = mosaic(layout, "RGGB").channel.reshape(5, 5)
+        assert channel[::-1].tolist() == [[0, 1, 0, 1, 0], [1, 2, 1, 2, 1]] * 2 + [[0, 1, 0, 1, 0]]
+    assert mosaic(cropped, "RGGB").channel.reshape(4, 4)[-1].tolist() == [0, 1, 0, 1]
+
+
 @pytest.mark.parametrize(("name", "side"), [("spectral_16", 4), ("spectral_25", 5)])
 def test_spectral_block_has_different_filters(name, side):
     channel = mosaic(fs.layout.grid(n_x=2 * side, n_y=side, pitch_um=1.0), name).channel.reshape(side, 2 * side)
@@ -103,12 +115,56 @@ def test_nearest_bus_assigns_ordered_sites():
         order = np.argsort(layout.columns["readout_order"][is_on_line])
         y_um = layout.centroid_um[is_on_line][order, 1]
         assert sorted(layout.columns["readout_order"][is_on_line]) == list(range(72))
-        assert np.all(np.diff(y_um) > -1e-9)
+        assert np.all(np.diff(y_um) < 1e-9)  # the top site first
 
 
 def test_readout_by_column_uses_its_indices():
     assert np.array_equal(readout_by(RINGS, "ring").readout_line, RINGS.columns["ring"])
-    assert readout_order(GRID).columns["readout_order"].tolist() == GRID.columns["row"].tolist()
+    assert readout_order(GRID).columns["readout_order"].tolist() == (11 - GRID.columns["row"]).tolist()
+
+
+@pytest.mark.parametrize("column", [None, "row", "column"])
+def test_rows_are_read_from_top(column):
+    layout = readout_by(GRID, column)
+
+    assert layout.columns["readout_order"].tolist() == (11 - GRID.columns["row"]).tolist()
+    assert layout.readout_line.tolist() == GRID.columns[column or "column"].tolist()
+
+
+@pytest.mark.parametrize(
+    ("scan", "axis", "sign", "lines"),
+    [
+        ("rows_from_top", 1, -1, "column"),
+        ("rows_from_bottom", 1, 1, "column"),
+        ("columns_from_left", 0, 1, "row"),
+        ("columns_from_right", 0, -1, "row"),
+    ],
+)
+def test_scan_orders_rows_and_columns(scan, axis, sign, lines):
+    bare = fs.Layout.from_polygons(GRID.polygons())
+    top_first = GRID.with_columns(row=11 - GRID.columns["row"])
+    disc = GRID[np.hypot(*GRID.centroid_um.T) < 0.4 * np.ptp(GRID.centroid_um)]
+    for layout in (GRID, bare, top_first, disc):
+        found = readout_by(layout, scan=scan)
+        position_um = sign * layout.centroid_um[:, axis]
+        assert np.allclose(found.columns["readout_order"], (position_um - position_um.min()) / 1.0)
+        if lines in layout.columns:
+            assert np.array_equal(found.readout_line, layout.columns[lines])
+    along = readout_order(GRID.with_columns(readout_line=GRID.columns[lines]), scan=scan).columns["readout_order"]
+    assert np.array_equal(along, readout_by(GRID, scan=scan).columns["readout_order"])
+
+
+def test_sites_without_rows_are_read_in_strips():
+    bounds_um = np.concatenate((RINGS.site_bounds_um[:, :2].min(axis=0), RINGS.site_bounds_um[:, 2:].max(axis=0)))
+    pitch_um = np.sqrt(np.prod(bounds_um[2:] - bounds_um[:2]) / RINGS.n_sites)
+    order = readout_by(RINGS).columns["readout_order"]
+    strip = np.floor((RINGS.centroid_um[:, 1] - bounds_um[1]) / pitch_um)
+
+    assert np.array_equal(order, strip.max() - strip)
+    # A column of equal numbers does not contain rows.
+    assert np.array_equal(
+        readout_by(RINGS.with_columns(row=np.zeros(RINGS.n_sites, int))).columns["readout_order"], order
+    )
 
 
 @pytest.mark.parametrize(

@@ -565,10 +565,40 @@ def test_last_frame_is_held_for_remaining_lines():
     assert [np.round(c.expected_e / per_level, 12).tolist() for c in captures] == [[1.0, 3.0, 3.0], [3.0, 3.0, 3.0]]
 
 
-def test_rolling_shutter_without_readout_order_is_rejected():
-    layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
-    with pytest.raises(SimulationError, match="readout_order"):
-        camera_of(layout).video([], exposure_s=0.01, seed=0, frame_s=0.1, line_s=1e-3)
+@pytest.mark.parametrize(("scan", "sign"), [(None, -1), ("rows_from_top", -1), ("rows_from_bottom", 1)])
+def test_edge_moving_right_is_skewed_as_in_cameras(scan, sign):
+    # v t_line = 0.1 µm / 1e-4 s * 1e-3 s = 1 µm per row: the top row of the picture is read first, so that lower rows see
+    # the edge farther to the right.
+    layout = fs.layout.grid(n_x=60, n_y=20, pitch_um=1.0)
+    grid = fs.Grid.centred((40, 160), 0.5)
+    frames = (bar_map(grid, -20.0 + 0.1 * k) for k in range(800))
+    options = {"exposure_s": 1e-4, "seed": 0, "frame_s": 1e-4, "line_s": 1e-3, "every": 1000}
+    camera = map_camera(layout)
+    if scan is None:
+        with pytest.warns(
+            FoveasimWarning, match="reads 20 rows from the top of the picture, because the layout has no"
+        ):
+            captures = camera.video(frames, **options)
+    else:
+        captures = camera.video(frames, **options, scan=scan)
+    (capture,) = captures
+    picture = capture.picture(of="expected_e", grid=fs.Grid.centred((20, 60), 1.0)).data[0]
+    centre_um = picture @ layout.centroid_um[:60, 0] / picture.sum(axis=1)
+
+    assert np.allclose(np.diff(centre_um), sign * 1.0, atol=1e-6)  # per row upwards
+    assert capture.settings["scan"] == (scan or "rows_from_top")
+
+
+def test_scan_replaces_readout_order():
+    layout = fs.layout.readout_by(fs.layout.grid(n_x=1, n_y=3, pitch_um=1.0))
+    times = {"frame_s": 1.0, "line_s": 0.5}
+
+    assert Shutter(layout, **times).delay_s.tolist() == [1.0, 0.5, 0.0]
+    assert Shutter(layout, **times, scan="rows_from_bottom").delay_s.tolist() == [0.0, 0.5, 1.0]
+    with pytest.raises(ParameterError, match="'scan' requires 'line_s'"):
+        camera_of(layout).video([], exposure_s=0.1, seed=0, frame_s=0.1, scan="rows_from_top")
+    with pytest.raises(ParameterError, match="'scan' must be one of"):
+        Shutter(layout, **times, scan="rows")
 
 
 def test_every_nth_frame_starts_exposure():
@@ -1494,7 +1524,7 @@ def test_command_leaves_finished_recordings_unchanged(directory, capsys):
         (("--frames", "none"), "no such file or directory"),
         (("--frames", "frames", "--fps", "0"), "--fps must be > 0"),
         (("--frames", "frames", "--line-s", "1e-4"), "frame_s"),
-        (("--frames", "frames", "--line-s", "1e-4", "--fps", "30"), "readout_order"),
+        (("--frames", "frames", "--line-s", "1e-4", "--fps", "30", "--scan", "rows"), "'scan' must be one of"),
         (("--frames", "frames", "--out", "v.txt"), "must end in"),
     ],
 )
