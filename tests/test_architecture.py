@@ -34,7 +34,7 @@ FLOORS = {
     "physics": [
         {
             "distortion", "integrate", "optics", "scene", "sensor", "layout._kernels", "layout.lattice", "layout.model",
-            "layout.adjacency", "layout.gaps", "layout.graph", "layout.packed",
+            "layout.adjacency", "layout.gaps", "layout.graph", "layout.packed", "layout.rows",
         },
         {"modes", "reconstruct"},
         {"columns"},

@@ -36,7 +36,7 @@ from foveasim.fields import Grid, PowerMap
 from foveasim.incidence import Incidence
 from foveasim.integrate import Integrator, outline_bounds_um
 from foveasim.layout.model import Layout
-from foveasim.layout.readout import Scan
+from foveasim.layout.rows import Scan
 from foveasim.modes import Between
 from foveasim.optics import Optics
 from foveasim.reconstruct import Picture, reference

@@ -21,7 +21,7 @@ from foveasim.camera._rates import expected_rates
 from foveasim.camera._steps import capture_for_time, capture_rates, check_exposure, seconds_of
 from foveasim.capture import Capture
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, warn
-from foveasim.layout.readout import Scan
+from foveasim.layout.rows import Scan
 from foveasim.modes import Between, Exposure, Shutter
 from foveasim.modes.frame_times import FrameTimes
 from foveasim.sensor.limits import EXPOSURE

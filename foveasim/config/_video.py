@@ -18,7 +18,7 @@ from foveasim.capture import Capture
 from foveasim.config._objects import Shot
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
-from foveasim.layout.readout import Scan
+from foveasim.layout.rows import Scan
 from foveasim.scene import Scene
 from foveasim.video import FrameSource, GazePath, count_recorded_frames, follow_gaze, write_video
 from foveasim.video.frame_source import list_pictures

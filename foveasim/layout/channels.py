@@ -15,10 +15,10 @@ from foveasim._core.names import CHANNEL_LETTERS, COLOURS, did_you_mean, list_na
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import finite_array, freeze
 from foveasim.errors import ParameterError
-from foveasim.layout._rows import lattice_index, site_rows
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.model import Layout, derived
+from foveasim.layout.rows import lattice_index, site_rows
 
 __all__ = ["MOSAICS", "graph_colouring", "mosaic", "random_channels"]
 

@@ -1,36 +1,26 @@
-"""
-Readout lines of photosites, and the order in which their exposures begin and end.
-
-The top is that of the upright picture, the highest y: the optical image is inverted, so that this edge of the sensor is the
-lower one in a camera that is held upright.
-"""
+"""Readout lines of photosites, and the order in which their exposures begin and end."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import shapely
 
 from foveasim._core.rings import positions_in_runs
-from foveasim._core.validation import Floats, Ints
 from foveasim.errors import ParameterError
-from foveasim.layout._rows import POSITION_COLUMNS, site_rows
 from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.model import Layout
+from foveasim.layout.rows import POSITION_COLUMNS, Scan, scan_axis, scan_index, site_rows
 
-__all__ = ["Scan", "nearest_bus", "readout_by", "readout_order", "scan_index"]
-
-#: Order of the rows or columns of a sensor, in the upright picture.
-Scan = Literal["rows_from_top", "rows_from_bottom", "columns_from_left", "columns_from_right"]
+__all__ = ["Scan", "nearest_bus", "readout_by", "readout_order"]
 
 
 @layout_edit(example={"scan": "rows_from_top"})
 def readout_by(layout: Layout, column: str | None = None, *, scan: Scan = "rows_from_top") -> Layout:
     """
-    Assign readout lines by a column, and the order in which a rolling shutter reads the sites.
+    Assign readout lines by a column, and the order of a rolling shutter.
 
     Parameters
     ----------
@@ -61,7 +51,7 @@ def readout_by(layout: Layout, column: str | None = None, *, scan: Scan = "rows_
     >>> layout.readout_line.tolist(), layout.columns["readout_order"].tolist()
     ([0, 1, 2, 0, 1, 2], [1, 1, 1, 0, 0, 0])
     """
-    axis = _axis(scan)
+    axis = scan_axis(scan)
     across = POSITION_COLUMNS[1 - axis]
     lines = column if column is not None else across if across in layout.columns else None
     if lines is not None:
@@ -69,33 +59,6 @@ def readout_by(layout: Layout, column: str | None = None, *, scan: Scan = "rows_
     if column not in (None, *POSITION_COLUMNS) or (column is not None and site_rows(layout, axis) is None):
         return readout_order(layout, scan=scan)
     return layout.with_columns(readout_order=scan_index(layout, scan))
-
-
-def scan_index(layout: Layout, scan: Scan) -> Ints:
-    """
-    Return the number of the row or column of each site in a scan, (n_site,), from 0.
-
-    Without rows and columns, these are strips with the mean distance of sites as their width.
-    """
-    axis = _axis(scan)
-    rows = site_rows(layout, axis)
-    index = None if rows is None else rows.astype(np.int64)
-    if index is None:
-        low_um, high_um = _bounds(layout)
-        pitch_um = math.sqrt(float(np.prod(high_um - low_um)) / layout.n_sites)
-        index = np.floor((layout.centroid_um[:, axis] - low_um[axis]) / pitch_um).astype(np.int64)
-    if scan in ("rows_from_top", "columns_from_right"):
-        index = -index
-    return np.asarray(index - index.min(initial=np.iinfo(np.int64).max), np.int64)
-
-
-def _bounds(layout: Layout) -> tuple[Floats, Floats]:
-    bounds_um = layout.site_bounds_um
-    return bounds_um[:, :2].min(axis=0), bounds_um[:, 2:].max(axis=0)
-
-
-def _axis(scan: Scan) -> int:
-    return 1 if scan.startswith("rows") else 0
 
 
 def nearest_bus(layout: Layout, buses: Sequence[Any], *, scan: Scan = "rows_from_top") -> Layout:
@@ -164,7 +127,7 @@ def readout_order(layout: Layout, *, scan: Scan = "rows_from_top") -> Layout:
     """
     line, (x_um, y_um) = layout.readout_line, layout.centroid_um.T
     keys = (x_um, y_um if scan == "rows_from_bottom" else -y_um)
-    if _axis(scan) == 0:
+    if scan_axis(scan) == 0:
         keys = (-y_um, x_um if scan == "columns_from_left" else -x_um)
     order = np.lexsort((*keys, line))
     counts = np.bincount(line) if line.size else np.zeros(0, np.int64)

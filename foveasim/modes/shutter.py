@@ -19,7 +19,7 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_per_site, finite_array, read_only
 from foveasim.errors import FoveasimWarning, ParameterError, warn
 from foveasim.layout.model import Layout
-from foveasim.layout.readout import Scan, scan_index
+from foveasim.layout.rows import Scan, scan_index
 from foveasim.modes.frame_times import FrameTimes
 from foveasim.sensor.limits import DURATION, EXPOSURE
 

@@ -17,7 +17,7 @@ from waiting import DEADLINE_S, wait_until
 import foveasim as fs
 from foveasim._core.random_streams import Streams
 from foveasim._io.images import write_picture
-from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.errors import FileError, FoveasimWarning, ParameterError
 from foveasim.modes import Exposure, Shutter
 from foveasim.sensor import merge_exposures
 from foveasim.video import (
@@ -566,7 +566,7 @@ def test_last_frame_is_held_for_remaining_lines():
 
 
 @pytest.mark.parametrize(("scan", "sign"), [(None, -1), ("rows_from_top", -1), ("rows_from_bottom", 1)])
-def test_edge_moving_right_is_skewed_as_in_cameras(scan, sign):
+def test_moving_edge_skews_as_in_cameras(scan, sign):
     # v t_line = 0.1 µm / 1e-4 s * 1e-3 s = 1 µm per row: the top row of the picture is read first, so that lower rows see
     # the edge farther to the right.
     layout = fs.layout.grid(n_x=60, n_y=20, pitch_um=1.0)
