@@ -3,8 +3,8 @@ EMVA 1288 parameters from frames of a sensor.
 
 System gain, noise, quantum efficiency, saturation, nonuniformity, linearity and dark current according to EMVA Standard 1288,
 Release 4.0 Linear (https://www.emva.org/standards-technology/emva-1288/), for sensors with a linear response. The parameters
-are computed for each class of photosites, with intervals of 95 % confidence. The split of the spatial variance into rows,
-columns and pixels requires a grid and is omitted, as are the plots and histograms of the standard.
+are computed for each class of photosites, with intervals of 95 % confidence. The parts of rows, columns and pixels of DSNU and
+PRNU are those of classes in complete rows and columns. The plots and histograms of the standard are omitted.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import OwnCheck
-from foveasim._core.validation import Bools, Floats, finite_array, read_only
+from foveasim._core.validation import Bools, Floats, Ints, finite_array, read_only
 from foveasim.errors import FoveasimWarning, ParameterError, type_name, warn
+from foveasim.layout.model import Layout
 from foveasim.metrics.emva_intervals import EmvaIntervals, Jackknife
+from foveasim.metrics.emva_nonuniformity import MeanImage, class_grids, mean_image, nonuniformity
 from foveasim.metrics.photon_transfer import (
     MIN_DARK_DN2,
     PhotonTransfer,
@@ -84,7 +86,11 @@ class Emva1288:
         DSNU1288: spatial standard deviation of dark frames over K; NaN if the estimated variance is negative.
     prnu_fraction : (n_class,) float64
         PRNU1288: spatial standard deviation at the level closest to half saturation, less the dark variance, over the
-        dark-corrected mean; NaN if the estimated variance is negative.
+        dark-corrected mean; NaN if the estimated variance is negative. Without what the photons of each site explain: shading
+        by the optics, and areas.
+    dsnu_row_e, dsnu_column_e, dsnu_pixel_e, prnu_row_fraction, prnu_column_fraction, prnu_pixel_fraction : (n_class,) float64
+        Parts of rows, columns and pixels; NaN for a class without complete rows and columns, or without a ``layout``, and if
+        the estimated variance is negative.
     dark_current_e_per_s, dark_current_from_variance_e_per_s : (n_class,) float64, e-/s
         Dark current from the mean and from the variance of dark frames against exposure; NaN without a dark series.
     underflow_fraction : (n_class,) float64
@@ -105,7 +111,8 @@ class Emva1288:
     contain the parameter. Those of saturation and linearity error are simultaneous over levels, and therefore wider, 98 to
     100 %; that of the saturation ends at the levels next to those that may have the highest variance. Intervals of standard
     deviations are those of the variances: a DSNU below the temporal noise of the mean has an interval from 0, whatever the
-    estimate is.
+    estimate is. The limits of parts of rows, columns and pixels assume Gaussian nonuniformity (chi-square distributions), and
+    those of the PRNU with ``highpass`` do, too.
     """
 
     classes: NDArray[Any]
@@ -121,6 +128,12 @@ class Emva1288:
     linearity_error_max_fraction: Floats
     dsnu_e: Floats
     prnu_fraction: Floats
+    dsnu_row_e: Floats
+    dsnu_column_e: Floats
+    dsnu_pixel_e: Floats
+    prnu_row_fraction: Floats
+    prnu_column_fraction: Floats
+    prnu_pixel_fraction: Floats
     dark_current_e_per_s: Floats
     dark_current_from_variance_e_per_s: Floats
     underflow_fraction: Floats
@@ -194,6 +207,8 @@ def emva1288(
     classes: ArrayLike | None = None,
     dark_series: Sequence[Any] | None = None,
     exposure_s: ArrayLike | None = None,
+    layout: Layout | None = None,
+    highpass: bool = False,
 ) -> Emva1288:
     """
     Compute EMVA 1288 parameters from uniformly illuminated frames and dark frames.
@@ -207,13 +222,20 @@ def emva1288(
     dark : sequence of levels
         Dark frames in the same form: one level for a constant exposure time, or one for each level.
     photons : (n_level,) or (n_level, n_site) float64
-        Expected photons per site at each level; they differ between sites of different size.
+        Expected photons per site at each level; they differ between sites of different size. Photons of each site are also
+        the shading, which is then no part of the PRNU: without them, uneven light counts as PRNU.
     classes : (n_site,), optional
         Class label of each site, such as its size or filter; a single class by default.
     dark_series : sequence of levels, optional
         Dark frames at three or more exposures ``exposure_s``, for the dark current and the dark noise at exposure 0.
     exposure_s : (n_exposure,) float64, s
         Exposure of each level of ``dark_series``.
+    layout : Layout, optional
+        Layout of the sites, for the parts of rows, columns and pixels; by default that of captures.
+    highpass : bool
+        Whether to suppress uneven light, of unknown photons per site, in the PRNU by the highpass filter of Release 4.0, which
+        subtracts a smoothed image (boxes of 7 x 7 and 11 x 11 pixels, and a binomial filter of 3 x 3). Needs a layout with rows
+        and columns. The part that the filter removes from the PRNU is corrected.
 
     Returns
     -------
@@ -228,7 +250,8 @@ def emva1288(
     -----
     FoveasimWarning
         When more than 0.5 % of the dark codes are 0: the clipping biases dark noise and DSNU low. When the variance is
-        highest at the last level: the saturation, and the parameters derived from it, are underestimated.
+        highest at the last level: the saturation, and the parameters derived from it, are underestimated. When there is a
+        layout, and no class has complete rows and columns.
 
     Examples
     --------
@@ -275,7 +298,22 @@ def emva1288(
     )
     noise_e = np.sqrt(np.maximum(noise_dn2, MIN_DARK_DN2)) / gain_dn_per_e
     dark_spatial_dn2 = unlit[2][:, dark_half, i_class]
-    bright_spatial_dn2 = lit[2][:, half, i_class] - dark_spatial_dn2
+    images = _images(frames, dark, half, dark_half, _relative_photons(photons, groups, half))
+    bright_spatial_dn2 = lit[2][:, half, i_class].copy()
+    for k, (bright, _) in enumerate(images):
+        bright_spatial_dn2[:, k] = (groups.subset_variances(bright.mean_dn) - groups.subset_means(bright.noise_dn2))[
+            :, k
+        ]
+    bright_spatial_dn2 -= dark_spatial_dn2
+    layout = getattr(next(iter(frames[0])), "layout", None) if layout is None else layout
+    if highpass and layout is None:
+        raise ParameterError("layout", "must be given for a highpass filter", None)
+    grids = [None] * i_class.size if layout is None else class_grids(_check_layout(layout, groups), groups)
+    if highpass and any(grid is None for grid in grids):
+        raise ParameterError(
+            "highpass", "needs complete rows and columns in each class", hint="pass photons of each site"
+        )
+    parts = nonuniformity(grids, images, gain_dn_per_e[0], signal_dn[0, half, i_class], highpass=highpass)
     deviation, is_compared = _linearity(level_ph, signal_dn, saturation_dn)
 
     subsets = {
@@ -297,7 +335,8 @@ def emva1288(
     underflow = _underflow_fraction(dark[0], groups)
     estimates: dict[str, NDArray[Any]] = {
         **{name: values[0] for name, values in subsets.items()},
-        **{name: np.sqrt(np.where(values[0] >= 0.0, values[0], np.nan)) for name, values in squares.items()},
+        **{name: _root(values[0]) for name, values in squares.items()},
+        **{name: _root(values) for name, values in parts.squares.items()},
         "is_quantisation_limited": noise_dn2[0] < MIN_DARK_DN2,
         "saturation_ph": level_ph[0, i_saturation, i_class],
         "linearity_error_min_fraction": _extreme(np.min, deviation[0], is_compared),
@@ -309,6 +348,7 @@ def emva1288(
     limits = {name: jackknife.interval(values) for name, values in subsets.items()}
     # The interval of a square begins at 0 if it contains 0.
     limits |= {name: np.sqrt(jackknife.interval(values)) for name, values in squares.items()}
+    limits |= {name: np.sqrt(values) for name, values in parts.limits.items()}
     is_limited = estimates["is_quantisation_limited"]
     for name in ("dark_noise_dn", "dark_noise_e"):
         limits[name][is_limited, 0] = 0.0
@@ -329,6 +369,49 @@ def emva1288(
             transfer.classes, {name: read_only(limits[name]) for name in (*names, *DERIVED) if name in limits}
         ),
     )
+
+
+def _root(squares: Floats) -> Floats:
+    """Return square roots, NaN of negative numbers."""
+    return np.sqrt(np.where(squares >= 0.0, squares, np.nan))
+
+
+def _check_layout(layout: Layout, groups: SiteClasses) -> Layout:
+    n_sites = int(groups.n_sites.sum())
+    if not isinstance(layout, Layout) or layout.n_sites != n_sites:
+        raise ParameterError("layout", f"must be a layout of the {n_sites} sites of the frames", layout)
+    return layout
+
+
+def _relative_photons(photons: ArrayLike, groups: SiteClasses, half: Ints) -> list[Floats | None]:
+    """Return the photons of each site over the mean of its class at the level of the PRNU of each class."""
+    values = finite_array("photons", photons, at_least=0.0)
+    if values.ndim == 1:
+        return [None] * half.size
+    found: list[Floats | None] = []
+    for k, level in enumerate(half):
+        level_ph = values[level]
+        if not np.all(level_ph[groups.class_index == k] > 0.0):
+            raise ParameterError("photons", f"must be > 0 at each site at the level of the PRNU, {level}")
+        # Sites of other classes are not used.
+        found.append(np.where(groups.class_index == k, level_ph / groups.mean(level_ph)[k], 1.0))
+    return found
+
+
+def _images(
+    frames: Sequence[Any], dark: Sequence[Any], half: Ints, dark_half: Ints, relative_photons: Sequence[Floats | None]
+) -> list[tuple[MeanImage, MeanImage]]:
+    """Return the bright and the dark mean image of each class at the level of its PRNU."""
+    known: dict[tuple[int, int], tuple[MeanImage, MeanImage]] = {}
+    images = []
+    for level, dark_level, relative in zip(half.tolist(), dark_half.tolist(), relative_photons, strict=True):
+        if relative is not None:
+            images.append((mean_image(frames[level], dark[dark_level], relative), mean_image(dark[dark_level])))
+            continue
+        if (level, dark_level) not in known:
+            known[level, dark_level] = mean_image(frames[level]), mean_image(dark[dark_level])
+        images.append(known[level, dark_level])
+    return images
 
 
 def _photons(photons: ArrayLike, groups: SiteClasses, n_levels: int) -> Floats:

@@ -12,6 +12,7 @@ import foveasim as fs
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.metrics import PhotonTransfer, draw_frames, emva1288, photon_transfer, predicted_photon_transfer
 from foveasim.metrics.emva_intervals import Jackknife
+from foveasim.metrics.emva_nonuniformity import MeanImage, spatial_parts
 from foveasim.metrics.photon_transfer import measure_subsets
 from foveasim.sensor import Sensor, noise_budget
 from foveasim.units import photon_energy_j
@@ -719,6 +720,163 @@ def test_inconsistent_dark_series_raises():
             emva1288(**arguments, **invalid)
 
 
+# -- rows, columns and pixels ----------------------------------------------------------------------------------------------
+
+#: Standard deviations of rows, columns and pixels: of the dark signal in DN, and of the response.
+DARK_PARTS_DN, RESPONSE_PARTS = np.array([3.0, 2.0, 4.0]), np.array([0.006, 0.004, 0.01])
+PARTS_PH = np.array([1000.0, 2000.0, 4000.0, 5000.0, 6000.0, 8000.0, 10_000.0, 11_000.0])
+
+
+def pattern(rng, shape, deviations):
+    """Return independent offsets of rows, columns and pixels."""
+    n_y, n_x = shape
+    row, column, pixel = (rng.normal(0.0, s, n) for s, n in zip(deviations, ((n_y, 1), (1, n_x), shape), strict=True))
+    return row + column + pixel
+
+
+def frames_of_parts(shape, *, shading=1.0, seed=0, n_frames=20, response=RESPONSE_PARTS):
+    """Return frames with 0.25 DN per photon, of which 10,000 saturate, with a noise of 2 DN and shot noise, and dark frames."""
+    rng = np.random.default_rng(seed)
+    dark_dn, relative = 50.0 + pattern(rng, shape, DARK_PARTS_DN), 1.0 + pattern(rng, shape, response)
+
+    def take(photons):
+        mean = 0.25 * np.minimum(photons * shading * relative, 10_000.0)
+        noise = rng.normal(0.0, 1.0, (n_frames, *shape))
+        deviation = np.sqrt(4.0 + 0.25 * np.where(photons > 10_000.0, 0.0, mean))
+        return np.rint(dark_dn + mean + deviation * noise).reshape(n_frames, -1)
+
+    return [take(photons) for photons in PARTS_PH], [take(0.0)]
+
+
+def parts_of(result, name, unit):
+    return np.array([getattr(result, f"{name}_{part}_{unit}")[0] for part in ("row", "column", "pixel")])
+
+
+def relative_errors(shape):
+    """Relative standard errors of the deviations of rows, columns and pixels, with the other parts in the means."""
+    n_y, n_x = shape
+    return np.sqrt(0.5 / np.array([n_y - 1, n_x - 1, (n_y - 1) * (n_x - 1)])) * np.array([1.1, 1.1, 1.3])
+
+
+def test_variances_of_rows_columns_and_pixels():
+    shape = (150, 200)
+    layout = fs.layout.grid(n_x=200, n_y=150, pitch_um=3.0)
+    frames, dark = frames_of_parts(shape)
+    result = emva1288(frames, dark, PARTS_PH, layout=layout)
+    half = 0.25 * 5000.0
+
+    gain = result.gain_dn_per_e[0]
+    assert gain == pytest.approx(0.25, rel=0.01)
+    errors = relative_errors(shape)
+    assert np.all(np.abs(gain * parts_of(result, "dsnu", "e") / DARK_PARTS_DN - 1.0) < 4.0 * errors)
+    assert np.all(
+        np.abs(parts_of(result, "prnu", "fraction") / RESPONSE_PARTS - 1.0)
+        < 4.0 * errors * (1.0 + DARK_PARTS_DN / (half * RESPONSE_PARTS))
+    )
+    assert result.dsnu_e[0] == pytest.approx(np.sqrt((parts_of(result, "dsnu", "e") ** 2).sum()), rel=0.02)
+    for name, true in zip(("row", "column", "pixel"), RESPONSE_PARTS, strict=True):
+        low, high = result.intervals[f"prnu_{name}_fraction"][0]
+        assert low < getattr(result, f"prnu_{name}_fraction")[0] < high
+        assert low < true < high
+    assert result.records()[0]["prnu_row_fraction"] == result.prnu_row_fraction[0]
+
+
+def test_order_of_sites_does_not_change_parts():
+    shape = (20, 30)
+    layout = fs.layout.grid(n_x=30, n_y=20, pitch_um=3.0)
+    frames, dark = frames_of_parts(shape, n_frames=4)
+    shuffled = np.random.default_rng(1).permutation(layout.n_sites)
+    first = emva1288(frames, dark, PARTS_PH, layout=layout)
+    other = emva1288([f[:, shuffled] for f in frames], [dark[0][:, shuffled]], PARTS_PH, layout=layout[shuffled])
+
+    assert np.allclose(parts_of(first, "prnu", "fraction"), parts_of(other, "prnu", "fraction"), rtol=1e-9)
+
+
+def test_photons_of_sites_are_no_prnu():
+    # Shading of cos⁴ to 25°: a relative standard deviation of 4.6 %, for a sensor whose sites are equal.
+    shape = (90, 120)
+    layout = fs.layout.grid(n_x=120, n_y=90, pitch_um=3.0)
+    x_um, y_um = layout.centroid_um.T
+    shading = np.cos(np.arctan(np.hypot(x_um, y_um) / 480.0)) ** 4
+    frames, dark = frames_of_parts(shape, shading=shading.reshape(shape), response=np.zeros(3))
+    uneven = emva1288(frames, dark, PARTS_PH * shading.mean(), layout=layout)
+    known = emva1288(frames, dark, PARTS_PH[:, None] * shading, layout=layout)
+    filtered = emva1288(frames, dark, PARTS_PH * shading.mean(), layout=layout, highpass=True)
+
+    assert uneven.prnu_fraction[0] == pytest.approx(shading.std() / shading.mean(), rel=0.02)
+    assert known.intervals["prnu_fraction"][0, 0] < 1e-4
+    assert known.intervals["prnu_fraction"][0, 1] < 2e-3
+    assert filtered.intervals["prnu_fraction"][0, 1] < 3e-3
+    assert np.allclose(known.dsnu_e, uneven.dsnu_e)
+
+
+def test_photons_explain_areas_of_sites():
+    rng = np.random.default_rng(5)
+    shape, area = (60, 50), rng.uniform(0.7, 1.3, (60, 50))
+    frames, dark = frames_of_parts(shape, shading=area, seed=6)
+    result = emva1288(frames, dark, PARTS_PH[:, None] * area.ravel())
+
+    assert result.prnu_fraction[0] == pytest.approx(np.sqrt((RESPONSE_PARTS**2).sum()), rel=0.1)
+    with pytest.raises(ParameterError, match="'photons' must be > 0 at each site at the level of the PRNU"):
+        emva1288(frames, dark, PARTS_PH[:, None] * np.append(area.ravel()[1:], 0.0))
+
+
+def test_highpass_filter_recovers_parts():
+    shape = (160, 180)
+    layout = fs.layout.grid(n_x=180, n_y=160, pitch_um=3.0)
+    x_um, y_um = layout.centroid_um.T
+    shading = (1.0 - 0.3 * (x_um**2 + y_um**2) / 360.0**2).reshape(shape)
+    frames, dark = frames_of_parts(shape, shading=shading, seed=2)
+    result = emva1288(frames, dark, PARTS_PH * shading.mean(), layout=layout, highpass=True)
+
+    assert np.allclose(parts_of(result, "prnu", "fraction"), RESPONSE_PARTS, rtol=0.25)
+    assert result.prnu_fraction[0] == pytest.approx(np.sqrt((RESPONSE_PARTS**2).sum()), rel=0.05)
+    # The filter subtracts: brighter sites count more, by the mean square of the relative shading.
+    weight = np.sqrt((shading**2).mean()) / shading.mean()
+    for name, true in zip(("row", "column", "pixel"), RESPONSE_PARTS, strict=True):
+        low, high = result.intervals[f"prnu_{name}_fraction"][0] / weight
+        assert low < true < high
+
+
+@pytest.mark.parametrize("highpass", [False, True])
+def test_parts_are_within_intervals(highpass):
+    # 200 sensors of few rows: 95 % of intervals contain the part, with a binomial standard error of 1.5 %.
+    shape, deviations = (34, 40), np.array([2.0, 3.0, 5.0])
+    grid = np.arange(34 * 40).reshape(shape)
+    rng = np.random.default_rng(3)
+    found = []
+    for _ in range(200):
+        image = MeanImage(pattern(rng, shape, deviations).ravel() + rng.normal(0.0, 1.0, grid.size), np.ones(grid.size))
+        parts = spatial_parts(image, grid, highpass=highpass)
+        found.append((parts.variance_dn2, (parts.low_dn2 < deviations**2) & (deviations**2 < parts.high_dn2)))
+    variances, is_inside = (np.array(values) for values in zip(*found, strict=True))
+
+    errors = variances.std(axis=0) / np.sqrt(200)
+    assert np.all(np.abs(variances.mean(axis=0) - deviations**2) < 4.0 * errors)
+    assert np.all(is_inside.mean(axis=0) > 0.88)
+
+
+def test_sites_without_rows_have_no_parts():
+    layout = fs.layout.log_polar(n_sectors=30, n_rings=20, r_min_um=10.0, r_max_um=90.0)
+    frames, dark = frames_of_parts((20, 30), n_frames=4)
+    with pytest.warns(FoveasimWarning, match="have no parts of rows, columns and pixels: the sites of no class are in"):
+        result = emva1288(frames, dark, PARTS_PH, layout=layout[np.arange(600)])
+    assert np.isnan(parts_of(result, "prnu", "fraction")).all()
+    assert not result.intervals.is_measured("prnu_row_fraction").any()
+    with (
+        pytest.raises(ParameterError, match="'highpass' needs complete rows and columns"),
+        pytest.warns(FoveasimWarning),
+    ):
+        emva1288(frames, dark, PARTS_PH, layout=layout[np.arange(600)], highpass=True)
+    with pytest.raises(ParameterError, match="'layout' must be given for a highpass filter"):
+        emva1288(frames, dark, PARTS_PH, highpass=True)
+    with pytest.raises(ParameterError, match="'layout' must be a layout of the 600 sites"):
+        emva1288(frames, dark, PARTS_PH, layout=layout[np.arange(10)])
+    grid = fs.layout.grid(n_x=30, n_y=20, pitch_um=3.0)
+    with pytest.raises(ParameterError, match="'highpass' needs at least 21 rows and columns in each class"):
+        emva1288(frames, dark, PARTS_PH, layout=grid, highpass=True)
+
+
 def test_results_have_repr_and_are_immutable(result):
     assert repr(result) == "Emva1288(52 levels, 2 classes)"
     rows = result.records()
@@ -728,7 +886,7 @@ def test_results_have_repr_and_are_immutable(result):
     assert "saturation / photons" in result._repr_html_()
     assert repr(result.transfer) == "PhotonTransfer(52 levels, 2 classes of 70000 sites)"
     assert "dsnu_e" in result._repr_html_()
-    assert repr(result.intervals).startswith("EmvaIntervals(20 parameters, 2 classes")
+    assert repr(result.intervals).startswith("EmvaIntervals(26 parameters, 2 classes")
     for values in (result.qe, result.intervals["qe"]):
         with pytest.raises(ValueError, match="read-only"):
             values[0] = 1.0
