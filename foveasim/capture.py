@@ -76,7 +76,8 @@ class Capture:
     layout : Layout
         The photosites.
     code : (n_site,) uint8 or uint16, DN
-        Digital values.
+        Digital values, as a camera delivers them. Differences of unsigned integers wrap around below 0: 3 - 5 is 65,534. Use
+        :attr:`code_dn` to subtract dark frames or other captures.
     electrons : (n_site,) int64, e-
         Collected charge, with shot noise, clipped at the full well capacity.
     expected_e : (n_site,) float64, e-
@@ -190,6 +191,24 @@ class Capture:
         """
         self._check_sensor(sensor)
         return find_column("name", name, self.layout, self, sensor)[0]
+
+    @property
+    def code_dn(self) -> NDArray[np.int32]:
+        """
+        Codes as signed integers, (n_site,) int32, DN: differences may be negative.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision")
+        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+        >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+        >>> first, second = (camera.capture(scene, exposure_s=1e-3, seed=seed) for seed in (0, 1))
+        >>> difference_dn = first.code_dn - second.code_dn
+        >>> bool(difference_dn.min() < 0)
+        True
+        """
+        return read_only(self.code.astype(np.int32))
 
     @property
     def saturated_fraction(self) -> float:
@@ -528,8 +547,8 @@ class Capture:
         -------
         pandas.DataFrame
             Index ``site``. Columns ``x_um``, ``y_um``, ``area_um2``, ``filter_name``, ``filter_of_site``, ``code``,
-            ``electrons``, ``expected_e``, registered columns, and those of the layout, named as in :meth:`to_xarray`.
-            ``attrs`` contains the attributes of :meth:`to_xarray`.
+            ``electrons``, ``expected_e``, registered columns such as ``code_dn`` (signed codes, for differences), and those of
+            the layout, named as in :meth:`to_xarray`. ``attrs`` contains the attributes of :meth:`to_xarray`.
 
         Examples
         --------

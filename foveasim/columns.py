@@ -180,6 +180,22 @@ for _name, _info in STORED.items():
 
 
 @COLUMNS.register(
+    "code_dn",
+    info=ColumnInfo(
+        title="signed code",
+        unit="DN",
+        note="for differences; codes are unsigned",
+        dtype="i4",
+        is_signal=True,
+        on_pages=False,
+    ),
+)
+def code_dn(capture: Capture) -> NDArray[np.int32]:
+    """Return the code of every site as signed integers, (n_site,) DN."""
+    return capture.code_dn
+
+
+@COLUMNS.register(
     "snr",
     info=ColumnInfo(
         title="signal-to-noise ratio",

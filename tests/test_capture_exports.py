@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -70,6 +71,19 @@ def assert_same(one, other):
 # -- labelled arrays and tables ---------------------------------------------------------------------------------------
 
 
+def test_differences_of_signed_codes_are_negative(capture):
+    other = dataclasses.replace(capture, code=capture.code[::-1].copy())
+    difference_dn = capture.code_dn - other.code_dn
+
+    assert difference_dn.dtype == np.int32
+    assert difference_dn.min() == -difference_dn.max() < 0
+    assert np.array_equal(difference_dn, capture.code.astype(float) - other.code.astype(float))
+    table = capture.to_pandas()
+    assert (table["code_dn"] - 2**capture.bits).max() < 0
+    assert np.array_equal(table["code_dn"], table["code"])
+    assert np.array_equal(capture.column("code_dn"), capture.code_dn)
+
+
 def test_dataset_has_dims_units_and_coordinates(capture):
     found = capture.to_xarray()
     n = capture.layout.n_sites
@@ -77,6 +91,7 @@ def test_dataset_has_dims_units_and_coordinates(capture):
     assert dict(found.sizes) == {"site": n, "filter": 3}
     assert {name: v.attrs["units"] for name, v in found.data_vars.items()} == {
         "code": "DN",
+        "code_dn": "DN",
         "electrons": "e-",
         "expected_e": "e-",
         "filter_of_site": "1",

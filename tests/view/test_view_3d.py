@@ -171,7 +171,7 @@ def test_polydata_contains_capture_values_and_settings():
         assert np.array_equal(mesh.cell_data[name], getattr(taken, name))
     assert mesh.active_scalars_name == "code"
     assert json.loads(mesh.field_data["units"][0]) == {
-        "code": "DN", "electrons": "e-", "expected_e": "e-", "area_um2": "µm²"
+        "code": "DN", "code_dn": "DN", "electrons": "e-", "expected_e": "e-", "area_um2": "µm²"
     }  # fmt: skip
     assert json.loads(mesh.field_data["settings"][0]) == json.loads(json.dumps(taken.settings))
 
