@@ -70,8 +70,8 @@ Reading = Annotated[
     list[str] | None,
     typer.Option(
         "--reading",
-        help="Other options of a GDSII or OASIS file: invalid=skip, duplicates=rename, missing=skip, circle_tolerance=1e-4; "
-        "repeatable.",
+        help="Other options of a layout file: unit=mm, parts=split, invalid=skip, and of GDSII and OASIS duplicates=rename, "
+        "missing=skip, circle_tolerance=1e-4; repeatable.",
     ),
 ]
 FramesPerS = Annotated[float | None, typer.Option("--fps", help="Frame rate in frames per second.")]
@@ -292,7 +292,7 @@ def convert(
     ] = None,
     invalid: Annotated[
         str | None,
-        typer.Option("--invalid", help="Invalid outlines of SOURCE, a GDSII or OASIS file: error, skip or repair."),
+        typer.Option("--invalid", help="Invalid outlines of SOURCE: error, skip or repair."),
     ] = None,
 ) -> None:
     """Convert a layout to another file format, and report rounding and dropped columns."""

@@ -26,6 +26,7 @@ from foveasim.config._requirements import Requirement
 from foveasim.distortion import LENSES
 from foveasim.errors import ParameterError
 from foveasim.layout import EDITS, LAYOUTS, PRESETS, RULES, DesignRules, Readout, Routing, read_layout
+from foveasim.layout.files import Invalid, LengthUnit, Parts
 from foveasim.maps import read_power_map
 from foveasim.modes.frame_times import check_times
 from foveasim.optics import PUPILS, ChiefRayTable, IlluminationTable, LateralColour, Optics, Seidel, Zernike, read_psfs
@@ -159,7 +160,9 @@ FILE_OPTIONS: dict[str, Any] = {
     "layers": str | dict[str, _Layer | dict[str, _Layer | float]] | None,
     "channels": dict[str, int | str] | None,
     "filter_names": list[str] | None,
-    "invalid": Literal["error", "skip", "repair"] | None,
+    "invalid": Invalid | None,
+    "unit": LengthUnit | None,
+    "parts": Parts | None,
     "duplicates": Literal["error", "rename"] | None,
     "missing": Literal["error", "skip"] | None,
     "circle_tolerance": float | None,

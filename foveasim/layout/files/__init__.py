@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 from foveasim._core.calls import Limits, OwnCheck, publish
 from foveasim._core.registry import import_all
@@ -30,13 +30,17 @@ from foveasim.layout.files._bundled import bundled_layouts, layout_path
 from foveasim.layout.files._common import FORMATS, WrittenLayout
 from foveasim.layout.files._derived import DERIVED_LAYERS, LayoutLayer
 from foveasim.layout.files._layers import layer_options, read_layer_map, reading_options
+from foveasim.layout.files._outlines import Invalid, LengthUnit, Parts
 from foveasim.layout.model import Layout
 
 __all__ = [
     "DERIVED_LAYERS",
     "FORMATS",
     "FileFormat",
+    "Invalid",
     "LayoutLayer",
+    "LengthUnit",
+    "Parts",
     "WrittenLayout",
     "bundled_layouts",
     "check_no_options",
@@ -63,7 +67,9 @@ def read_layout(
     layers: Mapping[str, Any] | str | Path | None = None,
     channels: Mapping[Any, int | str] | None = None,
     filter_names: Sequence[str] | None = None,
-    invalid: Literal["error", "skip", "repair"] | None = None,
+    invalid: Invalid | None = None,
+    unit: LengthUnit | None = None,
+    parts: Parts | None = None,
     duplicates: Literal["error", "rename"] | None = None,
     missing: Literal["error", "skip"] | None = None,
     circle_tolerance: Annotated[float | None, Limits(at_least=1e-6, at_most=0.03)] = None,
@@ -78,7 +84,7 @@ def read_layout(
     Parameters
     ----------
     path : path
-        GDSII, OASIS, npz, GeoJSON or GeoParquet, detected by content. Coordinates of GeoJSON and GeoParquet are in µm.
+        GDSII, OASIS, npz, GeoJSON or GeoParquet, detected by content.
     layer : int, (int, int), str or list of these, optional
         GDSII and OASIS: layer of the photosites, ``77``, with datatype ``(77, 3)`` or ``"77/3"``, or several. By default the
         layer of the photosites of a file that foveasim wrote; required for other files with shapes on several layers.
@@ -92,10 +98,18 @@ def read_layout(
     filter_names : sequence of str, optional
         GDSII and OASIS: names of the channels 0, 1, ..., such as ``filters.names``; by default R, G, B, W.
     invalid : {"error", "skip", "repair"}, optional
-        GDSII and OASIS: outlines that are not simple polygons, because they cross themselves or have no area, are an error by
-        default, which lists all of them with their positions. ``"skip"`` reads the others. ``"repair"`` also divides an outline
-        where it crosses itself, and reads the largest part. The parts of an outline that only touches itself are sites with the
-        same ``site_id``.
+        Not npz: outlines that are not simple polygons, because they cross themselves or have no area, are an error by
+        default, which lists them with their positions. ``"skip"`` reads the others, and omits rows without outline.
+        ``"repair"`` also divides an outline where it crosses itself, and reads the largest part. In GDSII and OASIS, the parts
+        of an outline that only touches itself are sites with the same ``site_id``.
+    unit : {"nm", "um", "mm", "cm", "m", "mil", "in"}, optional
+        GeoJSON and GeoParquet: unit of the coordinates where the file does not state a unit of length: files of other
+        programs are in degrees (GeoJSON always, GeoParquet by default), or in an unknown reference system. Those of foveasim
+        are in µm.
+    parts : {"error", "split", "largest"}, optional
+        GeoJSON and GeoParquet: a site is one polygon, and outlines of several parts are an error by default. ``"split"``
+        reads each part as a site, with the columns ``parent``, the number of the row, and ``part``; ``"largest"`` reads the
+        largest part.
     duplicates : {"error", "rename"}, optional
         GDSII and OASIS: several cells of one name are an error by default. ``"rename"`` reads all of them: a further cell ``A``
         is ``A$1``, or one with equal content is omitted. References that do not tell different cells apart remain an error.
@@ -126,8 +140,9 @@ def read_layout(
     Warns
     -----
     LayoutWarning
-        When invalid outlines are skipped or repaired, missing cells are skipped or cells renamed; the message lists them. When
-        records of a file have a meaning that other programs do not support either, such as absolute magnifications.
+        When invalid outlines are skipped or repaired, smaller parts are not read, missing cells are skipped or cells renamed;
+        the message lists them. When records of a file have a meaning that other programs do not support either, such as
+        absolute magnifications.
 
     Examples
     --------
@@ -147,7 +162,8 @@ def read_layout(
         "channels": channels,
         "filter_names": filter_names,
     }
-    given |= {"invalid": invalid, "duplicates": duplicates, "missing": missing, "circle_tolerance": circle_tolerance}
+    given |= {"invalid": invalid, "unit": unit, "parts": parts}
+    given |= {"duplicates": duplicates, "missing": missing, "circle_tolerance": circle_tolerance}
     chosen = validate_options(given | options, found.read_options, FORMATS, "read_options")
     with as_file_error(path, f"{found.title} layout", passes=(FoveasimError,)):
         layout: Layout = found.read(path, **chosen)

@@ -45,6 +45,8 @@ FILTER_NAMES = ("R", "G", "B", "W")
 #: Options of reading that the command line takes by their names, and the types of their values.
 FURTHER: dict[str, type[str | float]] = {
     "invalid": str,
+    "unit": str,
+    "parts": str,
     "duplicates": str,
     "missing": str,
     "circle_tolerance": float,
@@ -163,7 +165,7 @@ def _further_options(words: Sequence[str]) -> dict[str, Any]:
         name, _, text = (part.strip() for part in word.partition("="))
         if name not in FURTHER:
             raise ParameterError(
-                "reading", "must be options of GDSII and OASIS files", name, hint=possible_names(name, FURTHER)
+                "reading", "must be options of layout files", name, hint=possible_names(name, FURTHER)
             )
         try:
             options[name] = FURTHER[name](text)

@@ -2,12 +2,18 @@
 Layouts as GeoJSON (RFC 7946): one feature per site, columns as properties.
 
 Coordinates are in µm in the sensor plane, not in degrees. Numbers have the digits required for an exact round trip. The
-member ``foveasim``, which other programs ignore, contains the unit, the provenance and the types of the columns.
+member ``foveasim``, which other programs ignore, contains the unit, the provenance and the types of the columns. Files without
+this member are in degrees according to RFC 7946, or in the coordinate reference system that they name: the caller states the
+unit of lengths.
+
+Members that RFC 7946 does not define do not change the meaning of those that it defines (section 6.1), with the exceptions in
+:data:`MEANINGFUL`.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -23,7 +29,7 @@ from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import Floats, Ints, exact_integers
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
-from foveasim.errors import FileError
+from foveasim.errors import FileError, GeometryError
 from foveasim.layout.files._common import (
     FORMATS,
     WrittenLayout,
@@ -36,6 +42,19 @@ from foveasim.layout.files._common import (
     string_column,
     table_header,
 )
+from foveasim.layout.files._outlines import (
+    MAX_EXACT,
+    Invalid,
+    LengthUnit,
+    Parts,
+    agreed_unit,
+    check_plane,
+    grouped_polygons,
+    layout_of_geometries,
+    required_unit,
+    scaled,
+    with_fix,
+)
 from foveasim.layout.model import Layout
 
 __all__ = ["read", "write"]
@@ -45,10 +64,14 @@ CHUNK = 10_000
 #: JSON has no infinity, but numbers beyond the range of float64 are read as infinity.
 INFINITY = "1e999"
 NUMBER_TYPES: set[type] = {int, float}
-#: Integers up to the first are exact in float64; integers above the second are not supported.
-MAX_EXACT, MAX_FLOAT = 2**53, 2**1023
+#: Larger integers are not supported.
+MAX_FLOAT = 2**1023
 #: With more property names, only properties of all features are columns, as names could differ for every feature.
 MAX_NAMES = 256
+#: Members of other standards that change the meaning of coordinates: coordinate reference systems of GeoJSON 2008 and JSON-FG,
+#: quantised coordinates of TopoJSON, and the geometry of JSON-FG in its own system.
+CRS = ("crs", "coordRefSys")
+MEANINGFUL = (*CRS, "transform", "arcs", "place")
 
 
 def write(layout: Layout, path: Path) -> WrittenLayout:
@@ -83,7 +106,7 @@ def _json_strings(values: NDArray[Any]) -> list[str]:
     return [{"NaN": "null", "Infinity": INFINITY, "-Infinity": "-" + INFINITY}.get(t, t) for t in strings]
 
 
-def read(path: Path) -> Layout:
+def read(path: Path, *, unit: LengthUnit | None = None, invalid: Invalid = "error", parts: Parts = "error") -> Layout:
     """
     Read a GeoJSON FeatureCollection of polygons, in the order of the features.
 
@@ -91,13 +114,61 @@ def read(path: Path) -> Layout:
     numbers, and an empty string among strings. The provenance of the layout lists the names of other properties.
     """
     with as_file_error(path, "GeoJSON layout"):
-        document = _Document(path)
-        polygons = document.outlines()
+        document = _Document(path, parts)
+        unit_um = _unit_um(path, document.members, unit)
+        if document.problems and invalid == "error":
+            number, problem = next(iter(sorted(document.problems.items())))
+            n_more = len(document.problems) - 1
+            raise FileError(path, f"feature {number} {problem}" + f" (and {n_more} more)" * (n_more > 0))
         provenance, types = check_table_header(path, document.members.get("foveasim"), "GeoJSON")
         columns, dropped = document.columns(types)
         if dropped:
             provenance = {**provenance, "left_out_properties": dropped}
-        return layout_from_untrusted(polygons, columns, provenance)
+        xy_um, ring_offsets, polygon_offsets, polygons_of = document.outlines()
+        check_plane(path, document.z, float(np.abs(xy_um).max(initial=0.0)))
+        xy_um = xy_um if unit_um == 1.0 else scaled(xy_um, unit_um)
+        if invalid == "error" and (polygons_of == 1).all():
+            try:
+                return layout_from_untrusted((xy_um, ring_offsets, polygon_offsets), columns, provenance)
+            except GeometryError as error:
+                raise with_fix(path, error) from None
+        geometries = _geometries(xy_um, ring_offsets, polygon_offsets, polygons_of)
+        return layout_of_geometries(
+            path,
+            geometries,
+            columns,
+            provenance,
+            noun="feature",
+            invalid=invalid,
+            parts=parts,
+            problems={number: problem.partition(";")[0] for number, problem in document.problems.items()},
+        )
+
+
+def _unit_um(path: Path, members: Mapping[str, Any], unit: LengthUnit | None) -> float:
+    """Return the unit of the coordinates in µm, which only files of foveasim state."""
+    for name in MEANINGFUL:
+        if members.get(name) is not None and name not in CRS:
+            raise FileError(
+                path, f"has the member {name!r}, which changes its coordinates; convert it to plain GeoJSON"
+            )
+    if members.get("foveasim") is not None:
+        return agreed_unit(path, unit, 1.0, "µm")
+    systems = [json.dumps(members[name])[:80] for name in CRS if members.get(name) is not None]
+    if systems:
+        return required_unit(path, unit, f"has coordinates in the reference system {systems[0]}")
+    return required_unit(
+        path,
+        unit,
+        "has coordinates in degrees of longitude and latitude, as all GeoJSON files (RFC 7946) but those of foveasim",
+    )
+
+
+def _geometries(xy_um: Floats, ring_offsets: Ints, polygon_offsets: Ints, polygons_of: Ints) -> NDArray[Any]:
+    """Return shapely geometries of the features: polygons, multipolygons, or None."""
+    rings = shapely.linearrings(xy_um, indices=np.repeat(np.arange(ring_offsets.size - 1), np.diff(ring_offsets)))
+    polygons = shapely.polygons(rings, indices=np.repeat(np.arange(polygon_offsets.size - 1), np.diff(polygon_offsets)))
+    return grouped_polygons(polygons, polygons_of)
 
 
 class _Number(int):
@@ -113,48 +184,71 @@ class _Document:
     ``members``: members of the collection other than the features. ``rows``: properties of the features.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, parts: Parts) -> None:
         self._properties: list[dict[str, Any]] = []
         self._problems: dict[int, str] = {}
-        self._n_rings, self._n_vertices, self._xy = array("q"), array("q"), array("d")
+        self._n_polygons, self._n_rings, self._n_vertices, self._xy = array("q"), array("q"), array("q"), array("d")
+        self._z = [math.inf, -math.inf]
+        self._parts = parts
         document = json.loads(path.read_text(encoding="utf-8-sig"), object_hook=self._take)
         features = document.pop("features", None) if isinstance(document, dict) else None
         if not isinstance(features, list) or document.get("type") != "FeatureCollection":
             raise FileError(path, "is not a GeoJSON FeatureCollection")
         check_site_count(path, len(features))
         numbers = [each if type(each) is _Number else self._add(each) for each in features]
-        for i, number in enumerate(numbers):
-            if number in self._problems:
-                raise FileError(path, f"feature {i} {self._problems[number]}")
+        self.problems = {i: self._problems[number] for i, number in enumerate(numbers) if number in self._problems}
         self.members = document
         self.rows = [self._properties[number] for number in numbers]
         self._numbers = np.array(numbers, np.int64)
+
+    @property
+    def z(self) -> Floats:
+        """Smallest and largest third coordinate, infinite if there are none."""
+        return np.array(self._z, np.float64)
 
     def _take(self, item: dict[str, Any]) -> Any:
         """Add a feature and return its number; return other objects as they are."""
         return self._add(item) if item.get("type") == "Feature" and "geometry" in item else item
 
     def _add(self, feature: Any) -> _Number:
-        """Add the outline and the properties of a feature, or its problem."""
+        """Add the outlines and the properties of a feature, or its problem."""
         number = _Number(len(self._properties))
         properties = feature.get("properties") if isinstance(feature, dict) else None
         self._properties.append(properties if isinstance(properties, dict) else {})
-        n_rings = len(self._n_vertices)
-        problem = self._add_outline(feature.get("geometry") if isinstance(feature, dict) else None)
+        before = len(self._n_rings), len(self._n_vertices), len(self._xy)
+        problem = self._add_outlines(feature.get("geometry") if isinstance(feature, dict) else None)
+        other = next((name for name in MEANINGFUL if isinstance(feature, dict) and feature.get(name) is not None), None)
+        if other is not None:
+            problem = f"has the member {other!r}, which changes its coordinates; convert it to plain GeoJSON"
         if problem:
             self._problems[number] = problem
-        self._n_rings.append(len(self._n_vertices) - n_rings)
+            for values, n in zip((self._n_rings, self._n_vertices, self._xy), before, strict=True):
+                del values[n:]
+        self._n_polygons.append(len(self._n_rings) - before[0])
         return number
 
-    def _add_outline(self, geometry: Any) -> str:
-        """Add the rings of a geometry; return why it is invalid."""
-        kind, rings = (
+    def _add_outlines(self, geometry: Any) -> str:
+        """Add the polygons of a geometry; return why it is invalid."""
+        kind, polygons = (
             (geometry.get("type"), geometry.get("coordinates")) if isinstance(geometry, dict) else (None, None)
         )
-        if kind == "MultiPolygon" and isinstance(rings, list) and len(rings) == 1:
-            kind, rings = "Polygon", rings[0]
-        if kind != "Polygon" or not isinstance(rings, list) or not rings:
-            return f"must be one polygon, got {str(kind)[:40]}; write one feature per site"
+        if kind == "Polygon":
+            polygons = [polygons]
+        elif kind != "MultiPolygon" or not isinstance(polygons, list) or not polygons:
+            return f"must be one polygon, got {str(kind)[:40]}; write one feature per site, or pass invalid='skip'"
+        if len(polygons) > 1 and self._parts == "error":
+            return f"must be one polygon, got one of {len(polygons)} parts; pass parts='split' or parts='largest'"
+        for rings in polygons:
+            problem = self._add_rings(rings)
+            if problem:
+                return problem
+            self._n_rings.append(len(rings))
+        return ""
+
+    def _add_rings(self, rings: Any) -> str:
+        """Add the rings of a polygon; return why they are invalid."""
+        if not isinstance(rings, list) or not rings:
+            return "must be one polygon, got no rings; write one feature per site, or pass invalid='skip'"
         for ring in rings:
             if not isinstance(ring, list) or len(ring) < 4:
                 return "has a ring of fewer than 4 positions"
@@ -169,14 +263,22 @@ class _Document:
             for position in ring:
                 self._xy.append(position[0])
                 self._xy.append(position[1])
+                if len(position) == 3:
+                    self._z = [min(self._z[0], position[2]), max(self._z[1], position[2])]
             self._n_vertices.append(len(ring))
         return ""
 
-    def outlines(self) -> tuple[Floats, Ints, Ints]:
-        """Return the packed rings of the features, unchecked, without those of other members."""
-        rings, site_offsets = _runs(np.array(self._n_rings, np.int64), self._numbers)
+    def outlines(self) -> tuple[Floats, Ints, Ints, Ints]:
+        """
+        Return the packed rings of the features, unchecked, without those of other members.
+
+        The last array is the number of polygons of each feature.
+        """
+        polygons, _ = _runs(np.array(self._n_polygons, np.int64), self._numbers)
+        rings, polygon_offsets = _runs(np.array(self._n_rings, np.int64), polygons)
         points, ring_offsets = _runs(np.array(self._n_vertices, np.int64), rings)
-        return np.array(self._xy, np.float64).reshape(-1, 2)[points], ring_offsets, site_offsets
+        xy = np.array(self._xy, np.float64).reshape(-1, 2)[points]
+        return xy, ring_offsets, polygon_offsets, np.array(self._n_polygons, np.int64)[self._numbers]
 
     def columns(self, types: Mapping[str, Any]) -> tuple[dict[str, NDArray[Any]], list[str]]:
         """Return the columns of the properties, and the names of unsupported properties."""
@@ -229,5 +331,13 @@ def _is_json(_path: Path, head: bytes) -> bool:
 
 
 FORMATS.register(
-    "geojson", FileFormat(title="GeoJSON", suffixes=(".geojson", ".json"), matches=_is_json, read=read, write=write)
+    "geojson",
+    FileFormat(
+        title="GeoJSON",
+        suffixes=(".geojson", ".json"),
+        matches=_is_json,
+        read=read,
+        write=write,
+        read_options=("unit", "invalid", "parts"),
+    ),
 )

@@ -2,14 +2,16 @@
 Layouts as GeoParquet 1.1, through pyarrow.
 
 Outlines are WKB, and columns are Parquet columns. The files are exact and small, and GIS programs read them. Coordinates
-are in µm in the sensor plane, without a coordinate reference system. The metadata ``foveasim`` contain unit and provenance.
+are in µm in the sensor plane, an engineering coordinate reference system with this unit. The metadata ``foveasim`` contain unit
+and provenance. Files of other programs are read in the unit of length of their reference system; where it has none, as degrees
+or an unknown system, the caller states the unit.
 """
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import shapely
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
 from foveasim._io.atomic import atomic_write
-from foveasim._io.formats import FileFormat, as_file_error
+from foveasim._io.formats import FileFormat, FormatError, as_file_error
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout.files._common import (
     FORMATS,
@@ -26,12 +28,21 @@ from foveasim.layout.files._common import (
     check_readable,
     check_site_count,
     check_table_header,
-    layout_from_untrusted,
     max_decompressed_bytes,
     plain_columns,
     restore_column,
     string_column,
     table_header,
+)
+from foveasim.layout.files._outlines import (
+    MAX_EXACT,
+    Invalid,
+    LengthUnit,
+    Parts,
+    agreed_unit,
+    grouped_polygons,
+    layout_of_geometries,
+    required_unit,
 )
 from foveasim.layout.model import Layout
 
@@ -42,6 +53,31 @@ GEOMETRY = "geometry"
 VERSION = "1.1.0"
 #: Number of rows decompressed at a time.
 BATCH = 4096
+#: Name of the unit in the reference system of the sensor plane.
+MICROMETRE = {"type": "LinearUnit", "name": "micrometre", "conversion_factor": 1e-6}
+#: The sensor plane as a coordinate reference system (PROJJSON).
+SENSOR_PLANE = {
+    "$schema": "https://proj.org/schemas/v0.7/projjson.schema.json",
+    "type": "EngineeringCRS",
+    "name": "sensor plane",
+    "datum": {"type": "EngineeringDatum", "name": "sensor"},
+    "coordinate_system": {
+        "subtype": "Cartesian",
+        "axis": [
+            {"name": name, "abbreviation": name, "direction": "unspecified", "unit": MICROMETRE} for name in ("x", "y")
+        ],
+    },
+}
+#: Reference system of files that name none.
+DEFAULT_CRS = "OGC:CRS84, degrees of longitude and latitude"
+#: Metadata of the file and of the geometry column. Types, orientation and extent follow from the outlines; the epoch is that
+#: of a transformation between reference systems; the covering is a column of bounding boxes. Others are errors.
+UNDERSTOOD_OF_FILE = ("version", "primary_column", "columns")
+IRRELEVANT_OF_FILE = ("creator", "schema_version")
+UNDERSTOOD = ("encoding", "crs", "edges", "covering")
+IRRELEVANT = ("geometry_types", "geometry_type", "orientation", "bbox", "epoch")
+#: Depth of the lists of polygons and multipolygons in the native encodings.
+NATIVE = {"polygon": 2, "multipolygon": 3}
 #: WKB types of polygons and multipolygons, and the flag of a leading spatial reference identifier.
 POLYGON, MULTIPOLYGON = 3, 6
 WITH_SRID = 1 << 29
@@ -73,7 +109,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     column: dict[str, Any] = {
         "encoding": "WKB",
         "geometry_types": ["Polygon"],
-        "crs": None,
+        "crs": SENSOR_PLANE,
         "edges": "planar",
         "orientation": "counterclockwise",
     }
@@ -91,7 +127,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     return WrittenLayout(path=path, n_sites=layout.n_sites)
 
 
-def read(path: Path) -> Layout:
+def read(path: Path, *, unit: LengthUnit | None = None, invalid: Invalid = "error", parts: Parts = "error") -> Layout:
     """Read a table of polygons, in the order of its rows."""
     pa, parquet = _pyarrow(path)
     with as_file_error(path, "GeoParquet layout"), parquet.ParquetFile(path, page_checksum_verification=True) as file:
@@ -100,39 +136,110 @@ def read(path: Path) -> Layout:
         metadata = file.metadata.metadata or {}
         if b"geo" not in metadata:
             raise FileError(path, "is a Parquet table without geometry: it has no metadata 'geo'")
-        geo = json.loads(metadata[b"geo"])
-        name = geo["primary_column"]
-        if geo["columns"][name]["encoding"] != "WKB":
-            raise FileError(path, f"has the geometry encoding {geo['columns'][name]['encoding']!r:.40}, expected WKB")
-        kind = file.schema_arrow.field(name).type
-        if not (pa.types.is_binary(kind) or pa.types.is_large_binary(kind)):
-            raise FileError(path, f"has geometry of type {str(kind)[:40]}, expected binary WKB")
+        about = json.loads(metadata.get(b"foveasim", "null"))
+        name, column = _geometry_column(path, json.loads(metadata[b"geo"]))
+        unit_um = agreed_unit(path, unit, 1.0, "µm") if about is not None else _unit_um(path, column, unit)
+        _check_type(path, pa, file.schema_arrow.field(name).type, column["encoding"])
         table = _table(path, pa, file)
         if table.num_rows != file.metadata.num_rows:
             raise FileError(
                 path, f"is corrupt: it contains {table.num_rows} rows, but declares {file.metadata.num_rows}"
             )
         table.validate(full=True)
-        polygons = _polygons(path, table.column(name).to_numpy(zero_copy_only=False))
-        provenance, types = check_table_header(path, json.loads(metadata.get(b"foveasim", "null")), "GeoParquet")
+        geometries, problems = _geometries(pa, table.column(name), column["encoding"])
+        provenance, types = check_table_header(path, about, "GeoParquet")
+        boxes = {parts[0] for parts in column.get("covering", {}).get("bbox", {}).values()}
         columns, dropped = {}, []
-        for other in table.column_names:
-            kind = table.schema.field(other).type
-            if other == name:
-                continue
-            is_number = pa.types.is_boolean(kind) or pa.types.is_integer(kind) or pa.types.is_floating(kind)
-            is_string = pa.types.is_string(kind) or pa.types.is_large_string(kind)
-            has_null = table.column(other).null_count > 0
-            values = None
-            if (is_number or is_string) and not (has_null and not pa.types.is_floating(kind)):
-                values = string_column(table.column(other).to_pylist()) if is_string else table.column(other).to_numpy()
+        for other in (each for each in table.column_names if each != name and each not in boxes):
+            values = _column(pa, table.column(other))
             if values is None:
                 dropped.append(other)
             else:
                 columns[other] = restore_column(values, types.get(other))
         if dropped:
             provenance = {**provenance, "left_out_columns": dropped}
-        return layout_from_untrusted(polygons, columns, provenance)
+        return layout_of_geometries(
+            path,
+            geometries,
+            columns,
+            provenance,
+            noun="row",
+            unit_um=unit_um,
+            invalid=invalid,
+            parts=parts,
+            problems=problems,
+        )
+
+
+def _geometry_column(path: Path, geo: Any) -> tuple[str, dict[str, Any]]:
+    """Return name and metadata of the geometry column; reject metadata that are not known."""
+    version = str(geo.get("version", "1"))
+    if version.partition(".")[0] not in ("0", "1"):
+        raise FileError(path, f"is GeoParquet {version:.20}, expected 1.x")
+    name = geo["primary_column"]
+    column = geo["columns"][name]
+    for metadata, known in (
+        (geo, (*UNDERSTOOD_OF_FILE, *IRRELEVANT_OF_FILE)),
+        (column, (*UNDERSTOOD, *IRRELEVANT)),
+    ):
+        unknown = [key for key in metadata if key not in known]
+        if unknown:
+            raise FileError(path, f"has the metadata {unknown[0]!r:.60}, which are not known in GeoParquet 1.1")
+    if column.get("edges", "planar") != "planar":
+        raise FileError(path, f"has edges {column['edges']!r:.40} on a globe; the outlines of photosites are planar")
+    if column["encoding"] != "WKB" and column["encoding"] not in NATIVE:
+        expected = ", ".join(("WKB", *NATIVE))
+        raise FileError(path, f"has the geometry encoding {column['encoding']!r:.40}, expected one of {expected}")
+    return name, column
+
+
+def _unit_um(path: Path, column: dict[str, Any], unit: LengthUnit | None) -> float:
+    """Return the unit of the coordinates in µm: that of the reference system, or the one that the caller states."""
+    crs = column.get("crs", DEFAULT_CRS)
+    if crs is None:
+        return required_unit(path, unit, "has coordinates in an unknown reference system")
+    stated = _axis_units_um(crs)
+    if stated is not None:
+        return agreed_unit(path, unit, *stated)
+    name = crs.get("name", "without a name") if isinstance(crs, dict) else crs
+    return required_unit(path, unit, f"has coordinates in the reference system {str(name)[:80]}")
+
+
+def _axis_units_um(crs: Any) -> tuple[float, str] | None:
+    """Return the unit of length of both axes of a PROJJSON system in µm, and its name."""
+    if not isinstance(crs, dict) or crs.get("type") not in ("ProjectedCRS", "EngineeringCRS"):
+        return None
+    try:
+        units = [axis["unit"] for axis in crs["coordinate_system"]["axis"][:2]]
+    except (KeyError, TypeError):
+        return None
+    if len(units) != 2 or units[0] != units[1]:
+        return None
+    unit = {"type": "LinearUnit", "name": "metre", "conversion_factor": 1.0} if units[0] == "metre" else units[0]
+    if not isinstance(unit, dict) or unit.get("type") != "LinearUnit":
+        return None
+    factor = unit.get("conversion_factor")
+    if type(factor) not in (int, float) or not 0.0 < factor < np.inf:
+        return None
+    return float(f"{1e6 * factor:.12g}"), str(unit.get("name"))[:40]
+
+
+def _column(pa: Any, column: Any) -> NDArray[Any] | None:
+    """Return a column of numbers, booleans or strings, or None for other types."""
+    kind = column.type
+    if pa.types.is_dictionary(kind):  # categories
+        column = column.cast(kind.value_type)
+        kind = column.type
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        return string_column(["" if value is None else value for value in column.to_pylist()])
+    if pa.types.is_boolean(kind) or pa.types.is_integer(kind) or pa.types.is_floating(kind):
+        if column.null_count and not pa.types.is_floating(kind):
+            values = column.to_pylist()
+            if pa.types.is_boolean(kind) or any(value is not None and abs(value) > MAX_EXACT for value in values):
+                return None
+            return np.array([np.nan if value is None else value for value in values], np.float64)
+        return np.asarray(column.to_numpy())
+    return None
 
 
 def _pyarrow(path: Path) -> tuple[Any, Any]:
@@ -166,29 +273,100 @@ def _rows_per_batch(path: Path, metadata: Any) -> int:
     return int(min(max(max_decompressed_bytes(path) // max(longest, 1), 1), BATCH))
 
 
-def _polygons(path: Path, outlines: NDArray[Any]) -> NDArray[Any]:
-    """Convert WKB to polygons; multipolygons of one polygon are supported."""
+def _check_type(path: Path, pa: Any, kind: Any, encoding: str) -> None:
+    """Check the type of the geometry column before it is decompressed."""
+    if encoding == "WKB":
+        if not (pa.types.is_binary(kind) or pa.types.is_large_binary(kind)):
+            raise FileError(path, f"has geometry of type {str(kind)[:40]}, expected binary WKB")
+        return
+    inner = kind
+    for _ in range(NATIVE[encoding]):
+        inner = inner.value_type if pa.types.is_list(inner) or pa.types.is_large_list(inner) else pa.null()
+    names = [field.name for field in inner] if pa.types.is_struct(inner) else []
+    if names[:2] != ["x", "y"] or names[2:] not in ([], ["z"], ["m"], ["z", "m"]):
+        raise FileError(path, f"has geometry of type {str(kind)[:80]}, expected lists of coordinates x and y")
+
+
+def _geometries(pa: Any, column: Any, encoding: str) -> tuple[NDArray[Any], dict[int, str]]:
+    """Return polygons, multipolygons and None, and what the rows are whose geometry is not read."""
+    if encoding != "WKB":
+        return _native(pa, column, NATIVE[encoding]), {}
+    wkb = column.to_numpy(zero_copy_only=False)
     plain = WKB_HEADERS[POLYGON]
-    others = [row for row, wkb in enumerate(outlines) if wkb is None or wkb[:5] not in plain]
-    for row in others:
-        # Deeply nested collections would crash GEOS.
-        if not _is_multipolygon_of_one(outlines[row]):
-            raise FileError(path, f"row {row} must be one polygon; write one row per site")
-    geometries = np.asarray(shapely.from_wkb(outlines, on_invalid="raise"), dtype=object)
-    geometries[others] = shapely.get_geometry(geometries[others], 0)
-    return geometries
+    others = [row for row, each in enumerate(wkb) if each is None or each[:5] not in plain]
+    # Deeply nested collections would crash GEOS.
+    problems = {
+        row: f"must be one polygon, got {'none' if wkb[row] is None else 'another geometry'}"
+        for row in others
+        if not _is_multipolygon(wkb[row])
+    }
+    wkb = wkb.astype(object)
+    wkb[list(problems)] = None
+    return np.asarray(shapely.from_wkb(wkb, on_invalid="raise"), dtype=object), problems
 
 
-def _is_multipolygon_of_one(wkb: bytes | None) -> bool:
+def _is_multipolygon(wkb: bytes | None) -> bool:
+    """Return whether WKB is a multipolygon whose parts are polygons."""
     number = None if wkb is None else WKB_HEADERS[MULTIPOLYGON].get(wkb[:5])
     if wkb is None or number is None:
         return False
+    order: Literal["little", "big"] = "little" if wkb[0] else "big"
     at = 9 if number & WITH_SRID else 5
-    n_parts = int.from_bytes(wkb[at : at + 4], "little" if wkb[0] else "big")
-    return n_parts == 1 and wkb[at + 4 : at + 9] in WKB_HEADERS[POLYGON]
+    n_parts, at = int.from_bytes(wkb[at : at + 4], order), at + 4
+    for _ in range(n_parts):
+        number = WKB_HEADERS[POLYGON].get(wkb[at : at + 5])
+        if number is None:
+            return False
+        order = "little" if wkb[at] else "big"
+        at += 9 if number & WITH_SRID else 5
+        n_rings, at = int.from_bytes(wkb[at : at + 4], order), at + 4
+        for _ in range(n_rings):
+            if at >= len(wkb):
+                return False
+            at += 4 + 8 * _dimension(number) * int.from_bytes(wkb[at : at + 4], order)
+    return n_parts > 0
+
+
+def _dimension(number: int) -> int:
+    """Return the number of coordinates of a position, from a WKB type."""
+    iso = (number & 0xFFFF) // 1000
+    has_z, has_m = iso in (1, 3) or bool(number & 1 << 31), iso in (2, 3) or bool(number & 1 << 30)
+    return 2 + has_z + has_m
+
+
+def _native(pa: Any, column: Any, depth: int) -> NDArray[Any]:
+    """Return the geometries of nested lists of coordinates (GeoArrow, separate arrays of x and y)."""
+    array = column.combine_chunks()
+    array = array.chunk(0) if isinstance(array, pa.ChunkedArray) else array
+    is_null = array.is_null().to_numpy(zero_copy_only=False)
+    counts = []
+    for _ in range(depth):
+        lengths = array.value_lengths().fill_null(0).to_numpy(zero_copy_only=False).astype(np.int64)
+        counts.append(lengths)
+        array = array.flatten()
+    used = [field.name for field in array.type if field.name != "m"]
+    xy = np.stack([array.field(name).to_numpy(zero_copy_only=False).astype(np.float64) for name in used], axis=1)
+    if depth == max(NATIVE.values()):
+        polygons_of, rings_of, points_of = counts
+    else:
+        rings_of, points_of = counts
+        polygons_of = np.where(is_null, 0, 1)
+        rings_of = rings_of[~is_null]
+    if (points_of < 4).any() or (rings_of < 1).any():
+        raise FormatError("has a ring of fewer than 4 positions, or a polygon without rings")
+    rings = shapely.linearrings(xy, indices=np.repeat(np.arange(points_of.size), points_of))
+    polygons = shapely.polygons(rings, indices=np.repeat(np.arange(rings_of.size), rings_of))
+    return grouped_polygons(polygons, polygons_of)
 
 
 FORMATS.register(
     "geoparquet",
-    FileFormat(title="GeoParquet", suffixes=(".parquet", ".geoparquet"), signatures=(MAGIC,), read=read, write=write),
+    FileFormat(
+        title="GeoParquet",
+        suffixes=(".parquet", ".geoparquet"),
+        signatures=(MAGIC,),
+        read=read,
+        write=write,
+        read_options=("unit", "invalid", "parts"),
+    ),
 )

@@ -584,7 +584,7 @@ def test_foreign_geojson_reports_omitted_properties(tmp_path):
         )
     ]
     (tmp_path / "a").write_text("\ufeff " + json.dumps({"features": features, "type": "FeatureCollection"}))
-    layout = read_layout(tmp_path / "a")
+    layout = read_layout(tmp_path / "a", unit="um")
 
     assert layout.area_um2.tolist() == [4.0, 4.0]
     assert layout.channel.tolist() == [0, 1]
@@ -602,7 +602,7 @@ def test_features_inside_properties_are_not_sites(tmp_path):
     document = {"type": "FeatureCollection", "other": features[0], "features": features, "more": inner}
     (tmp_path / "a.geojson").write_text(json.dumps(document))
 
-    layout = read_layout(tmp_path / "a.geojson")
+    layout = read_layout(tmp_path / "a.geojson", unit="um")
 
     assert layout.area_um2.tolist() == [1.0, 4.0]
     assert layout.columns["n"].tolist() == [0, 1]
@@ -876,7 +876,7 @@ def test_invalid_geojson_geometry_is_rejected(tmp_path, geometry, match):
         f'{{"type": "FeatureCollection", "features": [{{"type": "Feature", "geometry": {geometry}}}]}}'
     )
     with pytest.raises(FileError, match=match):
-        read_layout(tmp_path / "a")
+        read_layout(tmp_path / "a", unit="um")
 
 
 def test_recursive_cell_is_rejected(tmp_path):

@@ -500,6 +500,7 @@ RING = "[[0,0],[9,0],[9,9],[0,0]]"
 
 
 def collection(*features, **members):
+    members = {"foveasim": origin(), **members}  # which states the unit
     text = "".join(f', "{name}": {value}' for name, value in members.items())
     return f'{{"type": "FeatureCollection", "features": [{",".join(features)}]{text}}}'.encode()
 
@@ -579,11 +580,12 @@ TRIANGLE = shapely.to_wkb(shapely.Polygon([(0, 0), (9, 0), (9, 9)]), byte_order=
 
 def parquet(*tables, geo=GEO, about=None, **options):
     """Return a Parquet file with geometry metadata, without the Arrow schema."""
+    about = origin() if about is None else about
     buffer = io.BytesIO()
     with pq.ParquetWriter(buffer, tables[0].schema, store_schema=False, compression="zstd", **options) as writer:
         for table in tables:
             writer.write_table(table)
-        writer.add_key_value_metadata({"geo": geo} | ({} if about is None else {"foveasim": about}))
+        writer.add_key_value_metadata({"geo": geo, "foveasim": about})
     return buffer.getvalue()
 
 
