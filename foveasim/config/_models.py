@@ -133,6 +133,7 @@ _FILE_TYPES: dict[str, Any] = {
     "outlines_um": list[_Outline] | None,
     "path": str,
     "picture": str,
+    "points_um": list[tuple[float, float]],
     "region": _Outline | None,
     "spectrum": list[list[float]] | None,
 }

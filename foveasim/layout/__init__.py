@@ -50,6 +50,7 @@ from foveasim.layout.generators.quadtree import quadtree
 from foveasim.layout.generators.sunflower import sunflower
 from foveasim.layout.generators.tiling import fill, tiling
 from foveasim.layout.generators.voronoi import voronoi
+from foveasim.layout.generators.voronoi_of import voronoi_of
 from foveasim.layout.generators.zones import zones
 from foveasim.layout.graph import SiteGraph, to_graph
 from foveasim.layout.model import Layout
@@ -139,6 +140,7 @@ __all__ = [
     "track_demand",
     "union",
     "voronoi",
+    "voronoi_of",
     "write_layout",
     "zones",
 ]

@@ -527,6 +527,7 @@ CALLS = {
     "layout.to_graph": lambda o: layout.to_graph(o.layout),
     "layout.union": lambda o: layout.union([o.plain, o.plain.translate(50.0, 0.0)]),
     "layout.voronoi": lambda o: layout.voronoi(30, size_um=(20.0, 20.0), seed=0),
+    "layout.voronoi_of": lambda o: layout.voronoi_of([(-3.0, 0.0), (1.0, 0.0)], size_um=(20.0, 20.0)),
     "layout.write_layout": lambda o: layout.write_layout(o.layout, o.path(".npz")),
     "layout.write_layout gds": lambda o: layout.write_layout(o.layout, o.path(".gds")),
     "layout.write_layout parquet": lambda o: layout.write_layout(o.layout, o.path(".parquet")),

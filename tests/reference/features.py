@@ -253,7 +253,7 @@ def axes():
 #: Edits that cut sites along other outlines, and leave slivers of some.
 CUTTING_EDITS = ("clip", "cut_along", "cut_out", "overlay")
 #: Features that only some generators have: sites with readout lines.
-WITHOUT_LINES = ("penrose", "sunflower", "voronoi")
+WITHOUT_LINES = ("penrose", "sunflower", "voronoi", "voronoi_of")
 
 
 def is_possible(row):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import shapely
@@ -17,7 +17,7 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout.diagrams.power import N_AUXILIARY, PowerDiagram, auxiliary_points_um
 from foveasim.layout.model import Layout
 
-__all__ = ["CellEdges", "IncrementalCells", "ring_edges", "voronoi_cells"]
+__all__ = ["CellEdges", "IncrementalCells", "clipped_cells", "ring_edges", "voronoi_cells"]
 
 #: Edges shorter than this fraction of the distance of their centres are one corner split by rounding, as on a square grid.
 SHORT_EDGE = 1e-9
@@ -40,10 +40,24 @@ def voronoi_cells(centres_um: Floats, region: shapely.Polygon) -> tuple[Floats, 
     """
     centres_um = np.ascontiguousarray(centres_um, np.float64)
     _check_centres(centres_um, region)
+    return _without_holes(*clipped_cells(centres_um, region))
+
+
+def clipped_cells(
+    centres_um: Floats, region: shapely.Polygon | shapely.MultiPolygon, *, separated: SeparatedParts = "neighbour"
+) -> tuple[Floats, Ints, Ints]:
+    """
+    Compute the Voronoi cells of distinct points in a region, as packed rings, with holes.
+
+    ``centres_um`` (n, 2) float64, µm: in the region or on its boundary. ``separated``: a part of a cell that the region
+    separates from its centre is assigned to a neighbour, or an error. Returns ``xy_um``, ``ring_offsets``, ``site_offsets``
+    as for :class:`foveasim.Layout`, one site per point. Raises GeometryError as :func:`voronoi_cells`.
+    """
     diagram = _voronoi(centres_um, region)
     unclipped = _unclipped_rings(diagram, centres_um)
     shapely.prepare(region)
-    return _clip(diagram, *unclipped, shapely.contains_properly(region, _polygons(*unclipped)), region)
+    is_inside = shapely.contains_properly(region, _polygons(*unclipped))
+    return _clip(diagram, *unclipped, is_inside, region, separated=separated)
 
 
 @dataclass(frozen=True)
@@ -80,6 +94,8 @@ def ring_edges(xy_um: Floats, ring_offsets: Ints) -> CellEdges:
     return CellEdges(cell, cell, xy_um, xy_um[next_vertex(ring_offsets)])
 
 
+#: What happens to parts of cells that the region separates from their centres.
+SeparatedParts: TypeAlias = Literal["error", "neighbour"]
 #: Function that returns the masses (n,) of n polygons from their edges.
 MassOf: TypeAlias = Callable[[CellEdges, int], Any]
 
@@ -145,7 +161,7 @@ class IncrementalCells:
         unclipped = _unclipped_rings(
             diagram, self.centres_um if self._weights_um2 is None else _inner_points_um(diagram)
         )
-        return _clip(diagram, *unclipped, self._is_inside, self.region, self._mass_of)
+        return _without_holes(*_clip(diagram, *unclipped, self._is_inside, self.region, self._mass_of))
 
     def _diagram(self) -> _Diagram:
         power = self._power
@@ -310,28 +326,50 @@ def _polygons(xy_um: Floats, offsets: Ints) -> NDArray[Any]:
     return Layout(xy_um, offsets, np.arange(offsets.size)).polygons()
 
 
+def _without_holes(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> tuple[Floats, Ints]:
+    """Return packed rings of cells, one each; raise for cells with holes."""
+    bad = np.flatnonzero(np.diff(site_offsets) > 1)
+    if bad.size:
+        raise GeometryError(
+            f"the cell of centre {bad[0]} within the region must be one polygon without holes; use more centres",
+            tuple(bad.tolist()),
+        )
+    return xy_um, ring_offsets
+
+
 def _clip(
     diagram: _Diagram,
     unclipped_um: Floats,
     offsets: Ints,
     is_inside: Bools,
-    region: shapely.Polygon,
+    region: shapely.Polygon | shapely.MultiPolygon,
     mass_of: MassOf | None = None,
-) -> tuple[Floats, Ints]:
+    separated: SeparatedParts = "neighbour",
+) -> tuple[Floats, Ints, Ints]:
     """Return packed rings of the cells within the region: those not inside are clipped."""
     parts, is_inside = _boundary_parts(diagram, is_inside, region, mass_of)
     boundary = np.flatnonzero(~is_inside)
-    rings_um, ring_offsets = np.zeros((0, 2)), np.zeros(1, np.int64)
+    rings = np.zeros((0, 2)), np.zeros(1, np.int64), np.zeros(1, np.int64)
     if parts is not None:
         if parts.missing.size:
             raise GeometryError(
                 f"centre {parts.missing[0]} is too close to another centre for float64", tuple(parts.missing.tolist())
             )
-        rings_um, ring_offsets = _rings(parts.join(boundary), boundary)
+        n_parts = np.bincount(parts.owner, minlength=is_inside.size)
+        if separated == "error" and (n_parts > 1).any():
+            bad = np.flatnonzero(n_parts > 1)
+            raise GeometryError(
+                f"the cell of point {bad[0]} has {n_parts[bad[0]]} parts in the region"
+                f"{f' (and {bad.size - 1} more)' if bad.size > 1 else ''}; take parts='neighbour', which adds them to the "
+                "cells that they touch, or add points",
+                tuple(bad.tolist()),
+            )
+        rings = _rings(parts.join(boundary), boundary)
     area_um2 = float(region.area)
-    merged = _merge_rings(unclipped_um, offsets, rings_um, ring_offsets, boundary, area_um2)
+    xy_um, ring_offsets, site_offsets = _merge_rings(unclipped_um, offsets, *rings, boundary, area_um2)
     # Cuts through a vertex of the region, within rounding.
-    return collapse_short_edges(*merged, SHORT_EDGE * math.sqrt(area_um2 / is_inside.size))
+    xy_um, ring_offsets = collapse_short_edges(xy_um, ring_offsets, SHORT_EDGE * math.sqrt(area_um2 / is_inside.size))
+    return xy_um, ring_offsets, site_offsets
 
 
 @dataclass(frozen=True)
@@ -451,40 +489,48 @@ def _edges_of(polygons: NDArray[Any]) -> CellEdges:
     return CellEdges(cell, cell, closed_um[:-1][is_start], closed_um[1:][is_start])
 
 
-def _rings(polygons: NDArray[Any], ids: Ints) -> tuple[Floats, Ints]:
-    """Return the packed outlines of polygons; raise for holes and multiple parts."""
-    is_odd = (shapely.get_type_id(polygons) != shapely.GeometryType.POLYGON) | (
-        shapely.get_num_interior_rings(polygons) > 0
-    )
+def _rings(polygons: NDArray[Any], ids: Ints) -> tuple[Floats, Ints, Ints]:
+    """Return the packed rings of polygons; raise for multiple parts."""
+    is_odd = shapely.get_type_id(polygons) != shapely.GeometryType.POLYGON
     if is_odd.any():
         bad = tuple(int(i) for i in ids[is_odd])
-        raise GeometryError(
-            f"the cell of centre {bad[0]} within the region must be one polygon without holes; use more centres", bad
-        )
-    closed_um, ring_of = shapely.get_coordinates(shapely.get_exterior_ring(polygons), return_index=True)
+        raise GeometryError(f"the cell of centre {bad[0]} within the region must be one polygon; use more centres", bad)
+    rings, polygon = shapely.get_rings(polygons, return_index=True)
+    closed_um, ring_of = shapely.get_coordinates(rings, return_index=True)
     is_last = np.append(ring_of[1:] != ring_of[:-1], True)
-    counts = np.bincount(ring_of[~is_last], minlength=polygons.size)
-    return closed_um[~is_last], np.concatenate(([0], np.cumsum(counts)))
+    ring_offsets = np.concatenate(([0], np.cumsum(np.bincount(ring_of[~is_last], minlength=rings.size))))
+    return closed_um[~is_last], ring_offsets, np.searchsorted(polygon, np.arange(polygons.size + 1))
 
 
 def _merge_rings(
-    xy_um: Floats, offsets: Ints, boundary_um: Floats, boundary_offsets: Ints, boundary: Ints, region_um2: float
-) -> tuple[Floats, Ints]:
+    xy_um: Floats,
+    offsets: Ints,
+    boundary_um: Floats,
+    boundary_offsets: Ints,
+    boundary_sites: Ints,
+    boundary: Ints,
+    region_um2: float,
+) -> tuple[Floats, Ints, Ints]:
     """Return packed rings of all cells, with those at the boundary replaced."""
     counts = np.diff(offsets)
     is_inside = np.ones(counts.size, bool)
     is_inside[boundary] = False
-    new_counts = counts.copy()
-    new_counts[boundary] = np.diff(boundary_offsets)
+    n_rings = np.ones(counts.size, np.int64)
+    n_rings[boundary] = np.diff(boundary_sites)
+    site_offsets = np.concatenate(([0], np.cumsum(n_rings)))
+    is_ring_inside = np.repeat(is_inside, n_rings)
+    new_counts = np.empty(is_ring_inside.size, np.int64)
+    new_counts[is_ring_inside] = counts[is_inside]
+    new_counts[~is_ring_inside] = np.diff(boundary_offsets)
     merged_offsets = np.concatenate(([0], np.cumsum(new_counts)))
     merged_um = np.empty((int(merged_offsets[-1]), 2))
-    is_from_inside = np.repeat(is_inside, new_counts)
+    is_from_inside = np.repeat(is_ring_inside, new_counts)
     merged_um[is_from_inside] = xy_um[np.repeat(is_inside, counts)]
     merged_um[~is_from_inside] = boundary_um
-    area_um2 = ring_area_um2(merged_um, merged_offsets)
-    bad = np.flatnonzero(area_um2 <= 0.0)
+    area_um2 = ring_area_um2(merged_um, merged_offsets)  # of holes negative
+    bad = np.flatnonzero(area_um2[site_offsets[:-1]] <= 0.0)
     if bad.size or abs(area_um2.sum() - region_um2) > AREA_ROUNDING * region_um2:
         raise GeometryError(
             "the centres are too close together for float64; increase their distances", tuple(bad.tolist())
         )
-    return merged_um, merged_offsets
+    return merged_um, merged_offsets, site_offsets

@@ -106,6 +106,10 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "tiling parameters": {"pitch_um": 8.0, "radius_um": 450.0, "border": "drop"},
     "translate kind": {"dx_um": 10.0, "dy_um": 0.0},
     "voronoi parameters": {"n_sites": 3000, "size_um": [600.0, 600.0]},
+    "voronoi_of parameters": {
+        "points_um": [[-200.0, -150.0], [180.0, -190.0], [-40.0, 20.0], [210.0, 110.0], [-180.0, 200.0], [60.0, 240.0]],
+        "size_um": [600.0, 600.0],
+    },
     "zernike": {"coefficients": {"4": 0.1}},
     "zone_plate kind": {"line_pairs_per_mm": 0.5},
     "zones parameters": {"side_um": [256.0, 512.0, 1024.0], "pitch_um": [4.0, 8.0, 16.0]},
