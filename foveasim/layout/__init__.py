@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from foveasim._core.calls import publish
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, graph_colouring, mosaic, random_channels
+from foveasim.layout.drc.cleaning import clean, cleaned
 from foveasim.layout.drc.measurements import RULES, Rule
 from foveasim.layout.drc.presets import PRESETS, Preset
 from foveasim.layout.drc.repair import Change, Changes, Stock, enforce, repair
@@ -89,6 +90,8 @@ __all__ = [
     "WrittenLayout",
     "adjacency",
     "bundled_layouts",
+    "clean",
+    "cleaned",
     "clip",
     "cut_along",
     "cut_out",

@@ -598,6 +598,11 @@ class Layout:
         enforce = load("layout.drc.repair").enforce
         return enforce(self, rules, repair=repair)
 
+    def clean(self, tolerance_um: float) -> tuple[Layout, Changes]:
+        """Snap vertices, fill narrow gaps and resolve overlaps; see :func:`foveasim.layout.clean`."""
+        clean = load("layout.drc.cleaning").clean
+        return clean(self, tolerance_um)
+
 
 # -- layouts from other layouts ----------------------------------------------------------------------------------
 

@@ -24,9 +24,7 @@ TILINGS = {
     "foveal_cartesian": lambda: layout.foveal_cartesian(n_rings=7, ring_ratio=1.4, pitch_um=0.4, n_fovea=3),
     "sunflower": lambda: layout.sunflower(n_sites=250, spacing_um=0.6),
     "voronoi": lambda: layout.voronoi(n_sites=200, size_um=(9.0, 9.0), n_iterations=3).translate(0.1, 0.1),
-    "voronoi_of": lambda: layout.voronoi_of(
-        np.random.default_rng(3).uniform(-4.4, 4.4, (150, 2)), size_um=(9.0, 9.0)
-    ),
+    "voronoi_of": lambda: layout.voronoi_of(np.random.default_rng(3).uniform(-4.4, 4.4, (150, 2)), size_um=(9.0, 9.0)),
     "quadtree": lambda: layout.quadtree(np.random.default_rng(1).random((32, 32)), pitch_um=0.3, limit=9.0, n_levels=5),
     "penrose": lambda: layout.penrose(side_um=0.9, size_um=10.0),
 }

@@ -47,16 +47,16 @@ class Change:
     Attributes
     ----------
     rule : str
-        Name of the violated rule.
-    action : {"dropped", "merged", "replaced", "shrunk"}
+        Name of the violated rule; of :func:`foveasim.layout.clean`, ``"tolerance_um"``, ``"gaps"`` or ``"overlaps"``.
+    action : {"dropped", "merged", "replaced", "shrunk", "snapped", "noded", "filled", "cut"}
     site_ids : tuple of int
         Indices of the sites in the input layout; for merged sites, all sites of the group.
     lost_um2 : tuple of float, µm²
-        Area that each site lost, if sites were shrunk.
+        Area that each site lost, negative if it gained area; empty for sites that were dropped, merged or replaced.
     """
 
     rule: str
-    action: Literal["dropped", "merged", "replaced", "shrunk"]
+    action: Literal["dropped", "merged", "replaced", "shrunk", "snapped", "noded", "filled", "cut"]
     site_ids: tuple[int, ...]
     lost_um2: tuple[float, ...] = ()
 
