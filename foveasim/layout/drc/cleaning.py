@@ -12,6 +12,7 @@ from foveasim._core.calls import LENGTH, check_arguments
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.validation import Bools, Floats, Ints, freeze
 from foveasim.errors import GeometryError
+from foveasim.layout.adjacency import near_boxes
 from foveasim.layout.drc.repair import Change, Changes, Stock
 from foveasim.layout.edit_registry import layout_edit
 from foveasim.layout.edits._parts import concatenate_layouts
@@ -19,8 +20,13 @@ from foveasim.layout.model import Layout, derived, layout_of
 
 __all__ = ["clean", "cleaned"]
 
+#: Distance of vertices that become one, relative to the tolerance: the diagonal of a crossing of two gaps of this width. With
+#: less than 1 / 0.87, the height of an equilateral triangle, two of its edges could pass through each other's ends in turns.
+VERTEX_DISTANCE = 2.0**0.5
 #: Rounds of snapping, each of which removes vertices or divides edges at vertices; a few suffice.
 MAX_ROUNDS = 60
+#: Largest number of vertices, relative to that of the input.
+MAX_GROWTH = 64
 #: Error of the width of a gap, relative to the tolerance.
 WIDTH_ERROR = 1e-3
 
@@ -53,8 +59,8 @@ def clean(layout: Layout, tolerance_um: Annotated[float, LENGTH]) -> tuple[Layou
     ----------
     layout : Layout
     tolerance_um : float, µm
-        Vertices within this distance of each other become one, at their mean; edges within this distance of a vertex pass
-        through it. Gaps that are nowhere wider are filled; wider ones remain.
+        Width of gaps and overlaps. Edges within this distance of a vertex pass through it, and vertices within √2 of it, the
+        diagonal of a crossing of gaps, become one at their mean. Gaps that are nowhere wider are filled; wider ones remain.
 
     Returns
     -------
@@ -168,7 +174,7 @@ def _snap(layout: Layout, tolerance_um: float) -> _Mesh:
     vertex = np.asarray(vertex.ravel(), np.int64)
     mesh = _Mesh(points_um, np.ones(points_um.shape[0]), vertex, layout.ring_offsets, layout.site_offsets, vertex)
     for _ in range(MAX_ROUNDS):
-        mesh, n_merged = _merge_points(mesh, tolerance_um)
+        mesh, n_merged = _merge_points(mesh, VERTEX_DISTANCE * tolerance_um)
         mesh = _without_spikes(mesh)
         mesh, n_inserted = _insert_points(mesh, tolerance_um)
         mesh = _without_spikes(mesh)
@@ -179,6 +185,8 @@ def _snap(layout: Layout, tolerance_um: float) -> _Mesh:
             weight = np.concatenate((mesh.weight, np.ones(crossings_um.shape[0])))
             mesh = mesh._replace(points_um=np.concatenate((mesh.points_um, crossings_um)), weight=weight)
             mesh, _ = _insert_points(mesh, tolerance_um)
+        if mesh.vertex.size > MAX_GROWTH * vertex.size:
+            break
     raise GeometryError("snapping does not settle; take another tolerance")
 
 
@@ -293,13 +301,21 @@ def _insert_points(mesh: _Mesh, tolerance_um: float) -> tuple[_Mesh, int]:
 
 
 def _crossings_um(mesh: _Mesh) -> Floats:
-    """Return the points (n, 2) in which edges cross."""
+    """Return the points (n, 2) in which edges cross; no vertex is near another edge."""
     edges, _, _ = _edges(mesh)
-    lines = shapely.linestrings(mesh.points_um[edges])
-    one, other = shapely.STRtree(lines).query(lines, predicate="crosses")
-    is_once = one < other
-    found = shapely.intersection(lines[one[is_once]], lines[other[is_once]])
-    return np.unique(shapely.get_coordinates(found), axis=0)
+    begin_um, end_um = mesh.points_um[edges[:, 0]], mesh.points_um[edges[:, 1]]
+    boxes_um = np.concatenate((np.minimum(begin_um, end_um), np.maximum(begin_um, end_um)), axis=1)
+    one, other = near_boxes(boxes_um, 0.0)
+    along_um, across_um = (end_um - begin_um)[one], (end_um - begin_um)[other]
+    first, last = (_cross(along_um, xy[other] - begin_um[one]) for xy in (begin_um, end_um))
+    begin, end = (_cross(across_um, xy[one] - begin_um[other]) for xy in (begin_um, end_um))
+    is_crossing = (first * last < 0.0) & (begin * end < 0.0)
+    fraction = (first / np.where(is_crossing, first - last, 1.0))[is_crossing, np.newaxis]
+    return np.unique(begin_um[other][is_crossing] + fraction * across_um[is_crossing], axis=0)
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 # -- gaps and overlaps ------------------------------------------------------------------------------------------------------
