@@ -59,7 +59,15 @@ INDIRECT = {
     "websockets": "uvicorn serves sockets with it",
 }
 #: Functions that take the name of a module.
-IMPORTING = {"__import__", "_imported", "find_spec", "import_module", "import_optional", "importorskip", "other_program"}
+IMPORTING = {
+    "__import__",
+    "_imported",
+    "find_spec",
+    "import_module",
+    "import_optional",
+    "importorskip",
+    "other_program",
+}
 
 
 def normalised(name):

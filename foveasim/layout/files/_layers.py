@@ -164,9 +164,7 @@ def _further_options(words: Sequence[str]) -> dict[str, Any]:
     for word in words:
         name, _, text = (part.strip() for part in word.partition("="))
         if name not in FURTHER:
-            raise ParameterError(
-                "reading", "must be options of layout files", name, hint=possible_names(name, FURTHER)
-            )
+            raise ParameterError("reading", "must be options of layout files", name, hint=possible_names(name, FURTHER))
         try:
             options[name] = FURTHER[name](text)
         except ValueError:

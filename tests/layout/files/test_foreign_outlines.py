@@ -258,7 +258,15 @@ def test_convert_states_unit(tmp_path):
     from foveasim.cli import app
 
     geojson(tmp_path / "a.geojson", [*SQUARES, TWO_PARTS])
-    words = ["convert", str(tmp_path / "a.geojson"), str(tmp_path / "a.npz"), "--reading", "unit=mm", "--reading", "parts=split"]
+    words = [
+        "convert",
+        str(tmp_path / "a.geojson"),
+        str(tmp_path / "a.npz"),
+        "--reading",
+        "unit=mm",
+        "--reading",
+        "parts=split",
+    ]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         result = CliRunner().invoke(app, words)
