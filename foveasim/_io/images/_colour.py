@@ -144,9 +144,9 @@ def encoded_picture(found: FilePicture, encoding: FileEncoding) -> EncodedPictur
         and colour.transfer in ("srgb", "linear")
         and not _needs_matrix(colour, n_colours)
     ):
-        return EncodedPicture(
-            pixels=pixels, encoding="linear" if colour.transfer == "linear" else "srgb", is_wide=n_colours == 3
-        )
+        is_linear = colour.transfer == "linear"
+        is_wide = is_linear and n_colours == 3 and pixels.dtype.kind == "f"
+        return EncodedPicture(pixels=pixels, encoding="linear" if is_linear else "srgb", is_wide=is_wide)
     else:
         convert = _space_to_srgb(colour, n_colours)
     light = convert(pixels[..., :n_colours] if n_colours < n_channels else pixels)

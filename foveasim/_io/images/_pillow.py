@@ -125,7 +125,7 @@ def _colour(image: Image.Image, stated: Colour) -> Colour:
         if gamma is not None and not gamma > 0.0:
             return Colour(problem="has a broken chunk gAMA or cHRM")
         return colour_of_gamma(gamma, info.get("chromaticity"))
-    if image.format in ("JPEG", "MPO") and _is_adobe_rgb(image):
+    if "exif" in info and image.format in ("JPEG", "MPO") and _is_adobe_rgb(image):
         return Colour(transfer=ADOBE_RGB_GAMMA, primaries=ADOBE_RGB_XY)
     return SRGB
 
