@@ -874,3 +874,18 @@ def test_unknown_files_and_extensions_are_rejected(tmp_path):
         read_psfs(tmp_path / "psf.npz")
     with pytest.raises(FileError, match=r"must end in one of \.fit, \.fits, \.npz"):
         PSFGrid.from_arrays(**GOOD).write(tmp_path / "psf.txt")
+
+
+def test_coordinates_of_labelled_arrays_are_not_dropped():
+    xarray = pytest.importorskip("xarray")
+    x_mm = 1e-3 * np.arange(-4.0, 5.0)
+    psf = xarray.DataArray(np.eye(9) + 0.1, {"y": x_mm, "x": x_mm})
+
+    with pytest.raises(
+        ParameterError, match=r"must have no coordinates of its own, .*; pass sample_x_um and sample_y_um"
+    ):
+        PSFGrid.from_arrays(psf, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0)
+    found = PSFGrid.from_arrays(
+        psf, x_um=0.0, y_um=0.0, wavelength_nm=550.0, sample_x_um=1e3 * psf.x, sample_y_um=1e3 * psf.y
+    )
+    assert found.centre == (4.0, 4.0)

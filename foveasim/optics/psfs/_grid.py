@@ -216,6 +216,9 @@ class PSFGrid:
         waves_nm = np.atleast_1d(as_numbers("wavelength_nm", wavelength_nm))
         x, y = (np.atleast_1d(as_numbers(name, at)) for name, at in (("x_um", x_um), ("y_um", y_um)))
         values = as_numbers("psf", psf, keep_type=True)
+        if sample_x_um is None and len(getattr(psf, "coords", ())):
+            hint = "pass sample_x_um and sample_y_um in µm, and psf.values"
+            raise ParameterError("psf", "must have no coordinates of its own, whose unit is not known", psf, hint=hint)
         if values.ndim == 2:
             values = values[np.newaxis, np.newaxis]
         elif values.ndim == 3:
