@@ -260,7 +260,7 @@ def describe(
 def convert(
     source: Annotated[Path, typer.Argument(help=LAYOUT_HELP)],
     target: Annotated[
-        Path, typer.Argument(help="File to write; the format by extension: .gds .oas .geojson .parquet .npz .svg.")
+        Path, typer.Argument(help="File to write; the format by extension: .gds .oas .geojson .parquet .nxs .npz .svg.")
     ],
     layer: Annotated[
         list[str] | None,

@@ -23,6 +23,7 @@ EXTRA_OF = {
             "sqlalchemy",
             "xarray",
         ),
+        "dxf": ("ezdxf",),
         "klayout": ("klayout",),
         "layout": ("gdstk",),
         "learn": ("torch",),

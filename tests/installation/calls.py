@@ -475,6 +475,8 @@ CALLS = {
     "explore.write_dataset workers": lambda o: explore.write_dataset(o.dataset, o.path(""), workers=1),
     "layout.adjacency": lambda o: layout.adjacency(o.layout),
     "layout.clip": lambda o: layout.clip(o.layout, SQUARE),
+    "layout.clean": lambda o: layout.clean(o.plain, 0.01),
+    "layout.cleaned": lambda o: layout.cleaned(o.plain, tolerance_um=0.01),
     "layout.cut_along": lambda o: layout.cut_along(o.layout, [[-30.0, 0.5], [30.0, 0.5]]),
     "layout.cut_out": lambda o: layout.cut_out(o.layout, SQUARE),
     "layout.describe": lambda o: layout.describe(o.layout),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import shapely
@@ -105,14 +105,15 @@ def clean(layout: Layout, tolerance_um: Annotated[float, LENGTH]) -> tuple[Layou
         return layout, Changes((), Stock.of(layout), Stock.of(layout))
     result = _with_unchanged(layout, result, is_changed)
     lost_um2 = layout.area_um2 - result.area_um2
+    actions: tuple[tuple[str, Literal["snapped", "noded", "filled", "cut"], Bools], ...] = (
+        ("tolerance_um", "snapped", is_moved),
+        ("tolerance_um", "noded", is_noded),
+        ("gaps", "filled", is_filled),
+        ("overlaps", "cut", is_cut),
+    )
     changes = [
         Change(rule, action, tuple(sites.tolist()), tuple(lost_um2[sites].tolist()))
-        for rule, action, chosen in (
-            ("tolerance_um", "snapped", is_moved),
-            ("tolerance_um", "noded", is_noded),
-            ("gaps", "filled", is_filled),
-            ("overlaps", "cut", is_cut),
-        )
+        for rule, action, chosen in actions
         if (sites := np.flatnonzero(chosen)).size
     ]
     found = derived(layout, f"cleaned within {tolerance_um:g} µm", result.rings_um)
@@ -204,7 +205,7 @@ def _merge_points(mesh: _Mesh, tolerance_um: float) -> tuple[_Mesh, int]:
         group = np.empty(order.size, np.int64)
         group[order] = _groups(order.size, pairs)
         labels, group = np.unique(group, return_inverse=True)
-        total = np.bincount(group, mesh.weight)
+        total = np.asarray(np.bincount(group, mesh.weight), np.float64)
         first = np.empty(labels.size, np.int64)
         first[group[::-1]] = np.arange(group.size)[::-1]
         mean_um = np.stack([np.bincount(group, mesh.weight * mesh.points_um[:, i]) / total for i in (0, 1)], axis=1)

@@ -1,5 +1,5 @@
 """
-Layout files: GDSII, OASIS, GeoJSON, GeoParquet, npz and SVG.
+Layout files: GDSII, OASIS, GeoJSON, GeoParquet, NeXus, npz, DXF and SVG.
 
 =============  ==================  =================================================================================
 extension      format              preserved by a round trip
@@ -7,8 +7,10 @@ extension      format              preserved by a round trip
 .npz           numpy arrays        everything, bit for bit
 .parquet       GeoParquet          everything, bit for bit; small files
 .geojson       GeoJSON             everything; columns of numbers and strings only
+.nxs, .h5      NeXus, pyFAI        everything, without holes; columns of numbers and strings only
 .gds, .oas     GDSII, OASIS        outlines on the database grid, order of the sites; columns of numbers, exactly and as
                                    64-bit types, of booleans and of short strings
+.dxf           DXF                 read-only: outlines and their layers
 .svg           SVG                 nothing: a drawing, write-only
 =============  ==================  =================================================================================
 
@@ -84,12 +86,14 @@ def read_layout(
     Parameters
     ----------
     path : path
-        GDSII, OASIS, npz, GeoJSON or GeoParquet, detected by content.
+        GDSII, OASIS, DXF, NeXus, npz, GeoJSON or GeoParquet, detected by content.
     layer : int, (int, int), str or list of these, optional
         GDSII and OASIS: layer of the photosites, ``77``, with datatype ``(77, 3)`` or ``"77/3"``, or several. By default the
-        layer of the photosites of a file that foveasim wrote; required for other files with shapes on several layers.
+        layer of the photosites of a file that foveasim wrote; required for other files with shapes on several layers. DXF:
+        name of the layer, or several.
     cell : str, optional
-        GDSII and OASIS: cell to read, with its complete cell hierarchy; required where there are several top cells.
+        GDSII and OASIS: cell to read, with its complete cell hierarchy; required where there are several top cells. NeXus: path
+        of the detector, ``"/entry/instrument/left"``; required where there are several.
     layers : mapping or path, optional
         GDSII and OASIS: layer map as for :func:`write_layout`. Its filter layers give the channels.
     channels : mapping, optional
@@ -103,11 +107,11 @@ def read_layout(
         ``"repair"`` also divides an outline where it crosses itself, and reads the largest part. In GDSII and OASIS, the parts
         of an outline that only touches itself are sites with the same ``site_id``.
     unit : {"nm", "um", "mm", "cm", "m", "mil", "in"}, optional
-        GeoJSON and GeoParquet: unit of the coordinates where the file does not state a unit of length: files of other
-        programs are in degrees (GeoJSON always, GeoParquet by default), or in an unknown reference system. Those of foveasim
-        are in µm.
+        GeoJSON, GeoParquet, DXF and NeXus: unit of the coordinates where the file does not state a unit of length. Files of
+        other programs are in degrees (GeoJSON always, GeoParquet by default), in an unknown reference system, or unitless
+        (DXF). Those of foveasim are in µm.
     parts : {"error", "split", "largest"}, optional
-        GeoJSON and GeoParquet: a site is one polygon, and outlines of several parts are an error by default. ``"split"``
+        GeoJSON, GeoParquet, DXF, NeXus: a site is one polygon; outlines of several parts are an error by default. ``"split"``
         reads each part as a site, with the columns ``parent``, the number of the row, and ``part``; ``"largest"`` reads the
         largest part.
     duplicates : {"error", "rename"}, optional
@@ -200,7 +204,7 @@ def write_layout(
     ----------
     layout : Layout
     path : path
-        The extension selects the format: ``.gds``, ``.oas``, ``.npz``, ``.geojson``, ``.parquet`` or ``.svg``.
+        The extension selects the format: ``.gds``, ``.oas``, ``.npz``, ``.geojson``, ``.parquet``, ``.nxs`` or ``.svg``.
     layer : int, (int, int) or str, optional
         GDSII and OASIS: layer of the photosites, by default 1, with the channel as datatype. ``(77, 3)`` or ``"77/3"`` sets the
         datatype; the channel is then a column.

@@ -222,8 +222,7 @@ class _Document:
             problem = f"has the member {other!r}, which changes its coordinates; convert it to plain GeoJSON"
         if problem:
             self._problems[number] = problem
-            for values, n in zip((self._n_rings, self._n_vertices, self._xy), before, strict=True):
-                del values[n:]
+            del self._n_rings[before[0] :], self._n_vertices[before[1] :], self._xy[before[2] :]
         self._n_polygons.append(len(self._n_rings) - before[0])
         return number
 

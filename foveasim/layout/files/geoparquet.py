@@ -219,7 +219,7 @@ def _axis_units_um(crs: Any) -> tuple[float, str] | None:
     if not isinstance(unit, dict) or unit.get("type") != "LinearUnit":
         return None
     factor = unit.get("conversion_factor")
-    if type(factor) not in (int, float) or not 0.0 < factor < np.inf:
+    if not isinstance(factor, int | float) or not 0.0 < factor < np.inf:
         return None
     return float(f"{1e6 * factor:.12g}"), str(unit.get("name"))[:40]
 

@@ -45,6 +45,7 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "blades kind": {"n_blades": 6},
     "chief ray table": {"image_height_um": [0.0, 500.0, 1000.0], "angle_deg": [0.0, 5.0, 10.0]},
     "checkerboard kind": {"square_mm": 16.0},
+    "clean kind": {"tolerance_um": 0.005},
     "clip kind": {"region": [[-200.0, -200.0], [200.0, -200.0], [200.0, 200.0], [-200.0, 200.0]], "cut": "drop"},
     "colour_chart kind": {"patch_mm": 35.0},
     "constant kind": {"value": 0.6},
