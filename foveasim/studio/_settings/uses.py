@@ -26,6 +26,7 @@ PLACES: dict[Use, tuple[str, str]] = {
     "psfs": ("optics.psfs", "PSFs"),
     "map": ("scene", "power map"),
     "cube": ("scene", "cube"),
+    "layout": ("layout", "layout file"),
 }
 #: Tables of formats, and the word for their archives of arrays in their metadata.
 TABLES: dict[Use, tuple[Any, str]] = {
