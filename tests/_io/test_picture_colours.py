@@ -509,6 +509,18 @@ def test_tiff_tags_that_change_pixels_are_rejected(tmp_path, tag, message):
         as_encoded(written(tmp_path, tiff_with(tag)))
 
 
+@pytest.mark.parametrize("is_big", [False, True])
+def test_profile_outside_tiff_is_reported(tmp_path, is_big):
+    path = tmp_path / "p.tif"
+    tifffile.imwrite(path, PATCH8, photometric="rgb", iccprofile=P3_PROFILE, bigtiff=is_big)
+    with tifffile.TiffFile(path) as file:
+        at = file.pages[0].tags[34_675].offset + (12 if is_big else 8)
+    content = bytearray(path.read_bytes())
+    content[at : at + 4] = struct.pack("<I", 2**31)
+    with pytest.raises(FileError, match=r"has a broken colour profile or colour tag \(34675\)"):
+        as_encoded(written(tmp_path, bytes(content)))
+
+
 def test_tiff_tags_are_sorted_into_classes(tmp_path):
     classes = [
         _tiff.UNDERSTOOD,

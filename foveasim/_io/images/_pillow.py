@@ -115,17 +115,17 @@ def _colour(image: Image.Image, stated: Colour) -> Colour:
     has_profile = "icc_profile" in info and info["icc_profile"] != b""
     if stated is not SRGB and not (has_profile and image.format == "AVIF"):
         return stated
-    if image.mode == "F" and image.format in ("PPM", "TIFF"):
+    if image.mode == "F":  # floating-point TIFF, PFM; a pickled image does not know its format
         return LINEAR
     if has_profile:
         profile = info["icc_profile"]
         return Colour(profile=profile) if isinstance(profile, bytes) else Colour(problem="has a broken colour profile")
-    if ("gamma" in info or "chromaticity" in info) and "srgb" not in info and image.format == "PNG":
+    if ("gamma" in info or "chromaticity" in info) and "srgb" not in info:
         gamma = info.get("gamma")
         if gamma is not None and not gamma > 0.0:
             return Colour(problem="has a broken chunk gAMA or cHRM")
         return colour_of_gamma(gamma, info.get("chromaticity"))
-    if "exif" in info and image.format in ("JPEG", "MPO") and _is_adobe_rgb(image):
+    if "exif" in info and _is_adobe_rgb(image):
         return Colour(transfer=ADOBE_RGB_GAMMA, primaries=ADOBE_RGB_XY)
     return SRGB
 

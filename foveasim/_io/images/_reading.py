@@ -55,7 +55,7 @@ def as_encoded(picture: Any, encoding: FileEncoding = "auto") -> EncodedPicture:
 
     ``picture``: path, image of Pillow, array, or a result of this function, which is returned unchanged. ``encoding``: "auto"
     is what the file states (profiles, gamma, primaries), or its format defines: linear for EXR, Radiance HDR, PFM and
-    floating-point TIFF, sRGB for all others, and for arrays; every other encoding replaces this. Raises FileError for files,
+    floating-point TIFF, sRGB for all others, and for arrays; linear for images of Pillow of the mode F; every other encoding replaces this. Raises FileError for files,
     and ParameterError for None and for data that are not a picture.
     """
     if isinstance(picture, EncodedPicture):

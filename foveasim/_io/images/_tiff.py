@@ -9,6 +9,7 @@ scikit-image, OpenCV and tifffile write numbers as they are: choose ``encoding="
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,10 @@ from foveasim._io.primaries import SRGB_XY
 MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 #: Tags of the colours.
 TRANSFER_FUNCTION, WHITE_POINT, PRIMARIES, ICC_PROFILE = 301, 318, 319, 34_675
+COLOUR_TAGS = frozenset((TRANSFER_FUNCTION, WHITE_POINT, PRIMARIES, ICC_PROFILE))
 X_RESOLUTION, Y_RESOLUTION = 282, 283
+#: Entries of a page that are searched.
+MAX_TAGS = 4096
 #: Tags that are understood, here or by tifffile: sizes, layout and compression of the pixels, photometric interpretation, kinds
 #: of samples, palette, orientation, resolution, colours.
 UNDERSTOOD = frozenset((
@@ -145,6 +149,10 @@ def _numbers(page: Any, code: int) -> tuple[float, ...]:
 
 def _colour(page: Any, picture: NDArray[Any]) -> Colour:
     """Return the colours that a page states."""
+    # tifffile omits tags that it cannot read.
+    lost = (_stored_codes(page) & COLOUR_TAGS) - {tag.code for tag in page.tags}
+    if lost:
+        return Colour(problem=f"has a broken colour profile or colour tag ({min(lost)})")
     if ICC_PROFILE in page.tags:
         profile = page.tags[ICC_PROFILE].value
         return (
@@ -171,6 +179,16 @@ def _colour(page: Any, picture: NDArray[Any]) -> Colour:
     if isinstance(transfer, str) and xy is None:
         return LINEAR if transfer == "linear" else SRGB
     return Colour(transfer=transfer, primaries=xy)
+
+
+def _stored_codes(page: Any) -> set[int]:
+    """Return the codes of the entries of a page in the file."""
+    file, format_ = page.parent.filehandle, page.parent.tiff
+    file.seek(page.offset)
+    n = struct.unpack(format_.tagnoformat, file.read(format_.tagnosize))[0]
+    entries = file.read(min(n, MAX_TAGS) * format_.tagsize)
+    starts = range(0, len(entries) - format_.tagsize + 1, format_.tagsize)
+    return {struct.unpack_from(f"{format_.byteorder}H", entries, start)[0] for start in starts}
 
 
 def _transfer_tables(page: Any, picture: NDArray[Any]) -> NDArray[Any] | None:
