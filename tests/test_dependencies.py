@@ -223,7 +223,7 @@ GUARDED = {
     "explore/executor.py": "check_installed",
     "explore/studies/study.py": "optuna requires sqlalchemy",
     "explore/worker_cache.py": "only in a worker, where distributed is imported",
-    "layout/files/_gdstk.py": "import_optional in layout/files/gds.py",
+    "layout/files/_gdstk.py": "import_optional in layout/files/_reading.py",
     "modes/_hdf5.py": "import_optional in modes/events.py",
     "studio/_server.py": "import_optional in run_studio",
     "view/meshes.py": "PyVista requires VTK",

@@ -300,10 +300,10 @@ from foveasim._core import jit
 jit.kernel_modules = lambda: ["foveasim.layout.files._kernels", "foveasim.scene._kernels"]
 print(jit.compile_kernels(n_workers={n_workers}))
 """
-    assert run(program, tmp_path)[0] == "5"
+    assert run(program, tmp_path)[0] == "7"
     stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb[ic]")}
 
-    assert len(list(tmp_path.rglob("*.nbc"))) == 6  # four kernels of files, and one for two types of pixels
+    assert len(list(tmp_path.rglob("*.nbc"))) == 8  # six kernels of files, and one for two types of pixels
     assert load_kernels(tmp_path) == ("(10, 1024)", "")
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb[ic]")} == stored
 

@@ -44,7 +44,7 @@ def test_round_ends_have_area_of_disc(library, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # gdspy leaves the file open
-def test_cells_of_one_name_are_reported_as_in_gdspy(library, tmp_path):
+def test_repeated_names_are_reported(library, tmp_path):
     cell = library.new_cell("AAAA").add(gdspy.Rectangle((0, 0), (1, 1)))
     library.new_cell("BBBB").add([gdspy.Rectangle((0, 0), (2, 2)), gdspy.CellReference(cell)])
     library.write_gds(str(tmp_path / "a.gds"))

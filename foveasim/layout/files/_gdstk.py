@@ -345,16 +345,16 @@ class _Arcs:
 
     def of_path(self, path: Any) -> Any:
         """Return the polygon of a path, with its repetition and properties."""
-        width = float(np.rint(path.widths()[0, 0] * self.scale))
+        half = 0.5 * float(np.rint(path.widths()[0, 0] * self.scale))
         end = path.ends[0]
         ends: tuple[float, float] | None = None
         if end == "round":
             self.are_used = True
         elif isinstance(end, str):
-            ends = (0.0, 0.0) if end == "flush" else (0.5 * width, 0.5 * width)
+            ends = (0.0, 0.0) if end == "flush" else (half, half)
         else:
             ends = (round(end[0] * self.scale), round(end[1] * self.scale))
-        outline = path_outline(np.rint(path.spine() * self.scale), width, ends, self.n)
+        outline = path_outline(np.rint(path.spine() * self.scale), half, ends, self.n)
         return self._polygon(outline, path, path.layers[0], path.datatypes[0])
 
     def of_circle(self, polygon: Any, radius: int) -> Any:

@@ -62,7 +62,7 @@ def _big_endian(data, at, n_bytes):
 @njit(types.int64(_bytes, _events))
 def gds_events(data, events):
     """
-    Find the records that gdstk reads otherwise than other programs, and the beginnings of the cells.
+    Find the cells, and the records that gdstk reads otherwise than other programs.
 
     ``data``: records that are complete up to ENDLIB. ``events`` (n, 3) int64, written: kind, position and number; filled as far
     as it suffices. Returns the number of events.
@@ -265,7 +265,7 @@ def _skip_field(data, at, stop, kind, is_number, state):
 
 @njit()
 def _skip_record(data, at, stop, record, state):
-    """Return the position behind a record whose type is before ``at``; -1 if it is truncated or invalid."""
+    """Return the position behind the fields of a record; -1 if it is truncated or invalid."""
     info = 0
     if 17 <= record <= 28:
         if at >= stop:
@@ -294,10 +294,11 @@ def _skip_record(data, at, stop, record, state):
 @njit(types.UniTuple(types.int64, 3)(_bytes, types.int64, types.int64, _state, _events))
 def walk_oasis(data, at, stop, state, events):
     """
-    Follow OASIS records up to ``stop``, or to one that is not read here: START, END, XGEOMETRY, CBLOCK, and unknown ones.
+    Follow OASIS records up to ``stop``, or to one that is not read here.
 
-    ``state`` (4,) int64, written: :data:`CELL_INDEX` and the following. ``events`` (n, 4) int64, written. Returns the position
-    of the next record, the number of events, and the reason of the stop.
+    These are START, END, XGEOMETRY, CBLOCK, and unknown ones. ``state`` (4,) int64, written: :data:`CELL_INDEX` and the
+    following. ``events`` (n, 4) int64, written. Returns the position of the next record, the number of events, and the reason
+    of the stop.
     """
     n = 0
     while at < stop:

@@ -159,7 +159,7 @@ class _Records:
     def _events(
         self, content: Any, at: int, stop: int, state: Any, origin: tuple[int, int]
     ) -> Iterator[tuple[Any, int]]:
-        """Yield events and the position of the next record; the last one is that of a CBLOCK, or the end."""
+        """Yield events, and the position of the next record: at last a CBLOCK or the end."""
         from foveasim.layout.files import _kernels as k
 
         events = np.empty((N_EVENTS, 4), np.int64)

@@ -14,11 +14,15 @@ the vertex. Corners of more than 90° are therefore cut off.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+#: Coordinates of a point or a vector.
+Point: TypeAlias = tuple[float, float]
 #: Largest distance between a circle and its outline, in radii, by default.
 CIRCLE_TOLERANCE = 1e-3
 #: Vertices of a disc are a multiple of this number.
@@ -28,8 +32,8 @@ SAME = 1e-9
 
 
 def n_vertices_of_disc(tolerance: float) -> int:
-    """Return the number of vertices with which no point of the outline is further than the tolerance, in radii, from it."""
-    # The vertices are further from the circle than the edges, by the square of the angle between two of them over 12.
+    """Return the number of vertices of a disc for a maximum distance from the circle, in radii."""
+    # That of the vertices, larger than that of the edges, is the square of the angle between two of them over 12.
     return STEPS * max(1, math.ceil(2.0 * math.pi / math.sqrt(12.0 * tolerance) / STEPS))
 
 
@@ -41,32 +45,29 @@ def disc(centre: NDArray[np.float64], radius: float, n: int) -> NDArray[np.float
     return centre + distance * np.stack((np.cos(angle), np.sin(angle)), axis=1)
 
 
-def path_outline(
-    spine: NDArray[np.float64], width: float, ends: tuple[float, float] | None, n: int
-) -> NDArray[np.float64]:
+def path_outline(spine: NDArray[np.float64], half: float, ends: Point | None, n: int) -> NDArray[np.float64]:
     """
     Return the outline of a path, (m, 2).
 
-    ``spine``: (k, 2) with at least one vertex. ``ends``: lengths by which a path is longer than its spine at its start and its
-    end; None for round ends. ``n``: vertices of a disc. A path of a single point is a disc, or a rectangle along x. The outline
-    of a path without width has no area.
+    ``spine``: (k, 2) with at least one vertex. ``half``: half of the width; 0 gives an outline without area. ``ends``: lengths
+    by which a path is longer than its spine at its start and its end; None for round ends. ``n``: vertices of a disc. A path of
+    a single point is a disc, or a rectangle along x.
     """
-    half = 0.5 * width
-    points = _distinct(spine.tolist())
+    points = _distinct([(x, y) for x, y in spine.tolist()])
     if ends is None and len(points) == 1:
         return disc(np.array(points[0]), half, n)
     start, end = ends or (0.0, 0.0)
     cap = _cap(half, n // 2) if ends is None else ()
     outline = [
-        *_side(points, half, start, end, 1.0),
+        *_side(points, half, (start, end), (1.0, 0.0)),
         *_placed(cap, points[-1], _direction(points[-2], points[-1]) if cap else (1.0, 0.0)),
-        *_side(points[::-1], half, end, start, -1.0),
+        *_side(points[::-1], half, (end, start), (-1.0, 0.0)),
         *_placed(cap, points[0], _direction(points[1], points[0]) if cap else (1.0, 0.0)),
     ]
     return np.array(outline)
 
 
-def _distinct(points: list[list[float]]) -> list[list[float]]:
+def _distinct(points: list[Point]) -> list[Point]:
     """Return the vertices without repeated ones, and without those on a straight line."""
     found = points[:1]
     for point in points[1:]:
@@ -80,16 +81,15 @@ def _distinct(points: list[list[float]]) -> list[list[float]]:
     return found
 
 
-def _direction(a: list[float], b: list[float]) -> tuple[float, float]:
+def _direction(a: Point, b: Point) -> Point:
     length = math.hypot(b[0] - a[0], b[1] - a[1])
     return (b[0] - a[0]) / length, (b[1] - a[1]) / length
 
 
-def _side(
-    points: list[list[float]], half: float, start: float, end: float, if_single: float
-) -> list[tuple[float, float]]:
-    """Return the left side of a path; a path of a single point has the direction (``if_single``, 0)."""
-    directions = [_direction(a, b) for a, b in pairwise(points)] or [(if_single, 0.0)]
+def _side(points: list[Point], half: float, ends: Point, single: Point) -> list[Point]:
+    """Return the left side of a path; one of a single point goes in the direction ``single``."""
+    directions = [_direction(a, b) for a, b in pairwise(points)] or [single]
+    start, end = ends
     (dx, dy), (x, y) = directions[0], points[0]
     side = [(x - half * dy - start * dx, y + half * dx - start * dy)]
     for k, (bx, by) in enumerate(directions[1:], 1):
@@ -110,11 +110,11 @@ def _side(
     return [*side, (x - half * dy + end * dx, y + half * dx + end * dy)]
 
 
-def _cap(half: float, n: int) -> list[tuple[float, float]]:
+def _cap(half: float, n: int) -> list[Point]:
     """
-    Return the vertices of a half disc between its ends, from the left side over the direction (1, 0).
+    Return the vertices of a half disc between its ends, in the direction (1, 0).
 
-    The ends are on the circle; the distance of the others gives the area of the half disc.
+    They begin at the left. The ends are on the circle; the distance of the others gives the area of the half disc.
     """
     step = math.pi / n
     # sin(step) * (2 * half * distance + (n - 2) * distance**2) = pi * half**2
@@ -122,8 +122,6 @@ def _cap(half: float, n: int) -> list[tuple[float, float]]:
     return [(distance * math.sin(k * step), distance * math.cos(k * step)) for k in range(1, n)]
 
 
-def _placed(
-    cap: list[tuple[float, float]] | tuple[()], at: list[float], direction: tuple[float, float]
-) -> list[tuple[float, float]]:
+def _placed(cap: Sequence[Point], at: Point, direction: Point) -> list[Point]:
     (x, y), (dx, dy) = at, direction
     return [(x + u * dx - v * dy, y + u * dy + v * dx) for u, v in cap]

@@ -1,4 +1,4 @@
-"""Layouts of GDSII and OASIS files: selection of layers, sites with their columns and channels, invalid outlines."""
+"""Layouts of GDSII and OASIS files: layers, sites with columns and channels, outlines."""
 
 from __future__ import annotations
 
@@ -310,7 +310,7 @@ def _merge_parts(pieces: Layout, first: Ints) -> NDArray[Any]:
 
 def _valid_polygons(path: Path, polygons: NDArray[Any], invalid: str) -> tuple[NDArray[Any], Ints]:
     """
-    Return the valid polygons, repaired ones included, and the sites to which they belong, ascending.
+    Return the valid polygons, repaired ones included, and their sites, ascending.
 
     Raises FileError when a polygon is invalid, and ``invalid`` is ``"error"``, or no valid polygon remains. Raises
     GeometryError when the layout is invalid for other reasons.
@@ -353,7 +353,7 @@ def _valid_polygons(path: Path, polygons: NDArray[Any], invalid: str) -> tuple[N
 
 
 def _repaired(polygon: Any) -> list[Any]:
-    """Return all parts of an outline that touches itself, and the largest part of one that crosses itself."""
+    """Return all parts of an outline that touches itself, and the largest of one that crosses."""
     parts = shapely.get_parts(shapely.make_valid(polygon))
     parts = parts[shapely.area(parts) > 0.0]
     if parts.size < 2:
@@ -366,7 +366,7 @@ def _repaired(polygon: Any) -> list[Any]:
 
 
 def _with_one_identity(layout: Layout, site: Ints) -> Layout:
-    """Return the layout with the identity of the first part for all parts of the same site of the file."""
+    """Return the layout with the identity of the first part for all parts of a site."""
     is_part = np.append(False, site[1:] == site[:-1])
     if not is_part.any():
         return layout

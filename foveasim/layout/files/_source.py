@@ -1,4 +1,4 @@
-"""What the records of a GDSII or OASIS file mean beyond what gdstk reads from it."""
+"""Content of GDSII and OASIS files beyond what gdstk reads, and edits of their bytes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Source:
 
 
 def edited(content: bytes, edits: Sequence[Edit]) -> bytes | None:
-    """Return the content after the edits, without those in a part that is replaced; None without edits."""
+    """Return the content after edits, of which the first wins; None without edits."""
     if not edits:
         return None
     parts: list[bytes] = []

@@ -480,7 +480,7 @@ def test_outline_of_path_matches_klayout(points, half, start, end, is_round):
         return
     ends = (half, half, True) if is_round else (start, end)
     expected = klayout.Region(klayout_path(points, 2 * half, *ends).polygon()).merged()
-    outline = _paths.path_outline(np.array(points, float), 2.0 * half, None if is_round else (start, end), 60)
+    outline = _paths.path_outline(np.array(points, float), half, None if is_round else (start, end), 60)
     polygon = shapely.Polygon(outline)
 
     assert polygon.is_valid
@@ -648,7 +648,7 @@ def test_vertex_limit_of_gdsii_is_checked(tmp_path):
 
 
 @pytest.mark.parametrize("extension", ["gds", "oas", "geojson", "parquet"])
-def test_outlines_that_cannot_be_read_are_not_written(tmp_path, extension):
+def test_unreadable_outlines_are_not_written(tmp_path, extension):
     with pytest.raises(GeometryError, match="site 0 has 33000 vertices, too many for a photosite"):
         ring_layout(33_000).write(tmp_path / f"a.{extension}")
     assert not list(tmp_path.iterdir())
