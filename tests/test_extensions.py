@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from itertools import count
 
 import numpy as np
@@ -33,6 +34,7 @@ from foveasim.scene import CUBE_FORMATS, SCENES
 from foveasim.sensor import PIXEL_OPTICS, Footprints, PixelOptics
 from foveasim.sensor.effects import EFFECTS, AdditiveNoise, Effect, FixedFactor, FixedOffset
 from foveasim.sensor.spectral import CURVES
+from foveasim._core.extras import EXTRA_OF
 from foveasim.testing import check_all, check_extension, extensions
 
 REGISTRIES = (
@@ -44,13 +46,15 @@ NUMBERS = count()
 SLOW = {"power map format", "cube format"}
 
 
+def marks_of(kind, name):
+    libraries = [module for module, extra in EXTRA_OF.items() if extra == "dxf"] if name == "dxf" else []
+    skip = [pytest.mark.skip(reason="in tests/interop")] if any(find_spec(m) is None for m in libraries) else []
+    return skip + ([pytest.mark.slow] if kind in SLOW else [])
+
+
 @pytest.mark.parametrize(
     ("kind", "name"),
-    [
-        pytest.param(kind, name, marks=[pytest.mark.slow] if kind in SLOW else [])
-        for kind, name in extensions()
-        if " of test_" not in name
-    ],
+    [pytest.param(kind, name, marks=marks_of(kind, name)) for kind, name in extensions() if " of test_" not in name],
 )
 def test_extension_passes_its_check(kind, name):
     check_extension(kind, name)

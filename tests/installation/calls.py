@@ -335,6 +335,7 @@ CALLS = {
     "read_layout geojson": lambda o: fs.read_layout(o.written(".geojson", o.layout.write)),
     "read_layout gds": lambda o: fs.read_layout(o.written(".gds", o.layout.write)),
     "read_layout oas": lambda o: fs.read_layout(o.written(".oas", o.layout.write)),
+    "read_layout nxs": lambda o: fs.read_layout(o.written(".nxs", o.layout.write)),
     "read_layout parquet": lambda o: fs.read_layout(o.written(".parquet", o.layout.write)),
     "read_power_map": lambda o: fs.read_power_map(o.written(".npz", lambda p: fs.write_power_map(o.power_map, p))),
     "read_power_map npy": lambda o: fs.read_power_map(

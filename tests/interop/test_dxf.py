@@ -105,7 +105,7 @@ def test_blocks_are_repeated_and_mirrored(tmp_path):
     assert sorted(map(tuple, layout.site_bounds_um[:, :2].round(6).tolist())) == sorted(corners)
 
 
-def test_layer_zero_of_block_is_that_of_reference(tmp_path):
+def test_layer_zero_is_that_of_reference(tmp_path):
     document, model = drawing()
     document.blocks.new("P").add_lwpolyline([(0, 0), (2, 0), (0, 2)], close=True)
     model.add_blockref("P", (0, 0), {"layer": "RED"})
@@ -229,3 +229,7 @@ def test_changed_text_reads_or_raises(tmp_path):
             continue
         except Warning:
             continue
+
+
+def test_format_passes_check_of_extensions():
+    fs.testing.check_extension("layout format", "dxf")

@@ -1,4 +1,4 @@
-"""Cleaning of layouts: vertices snapped, narrow gaps filled, overlaps resolved, with a record of the changes."""
+"""Cleaning of layouts: snapped vertices, filled gaps, resolved overlaps, and the changes."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def clean(layout: Layout, tolerance_um: Annotated[float, LENGTH]) -> tuple[Layou
 @layout_edit(example={"tolerance_um": 0.005}, name="clean")
 def cleaned(layout: Layout, *, tolerance_um: Annotated[float, LENGTH]) -> Layout:
     """
-    Return a layout without gaps and overlaps up to a tolerance, as :func:`clean` without its changes.
+    Return a layout without gaps and overlaps up to a tolerance, as :func:`clean`.
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ def _groups(n: int, pairs: Ints) -> Ints:
 
 
 def _without_spikes(mesh: _Mesh) -> _Mesh:
-    """Remove repeated vertices, vertices to which an edge goes and returns, and rings without area."""
+    """Remove repeated vertices, ends of edges there and back, and rings without area."""
     while True:
         following = next_vertex(mesh.ring_offsets)
         before = np.empty_like(following)
@@ -263,7 +263,7 @@ def _without_spikes(mesh: _Mesh) -> _Mesh:
 
 
 def _edges(mesh: _Mesh) -> tuple[Edges, Ints, Bools]:
-    """Return the distinct edges (n, 2), and for each vertex of the rings its edge, and whether it is the lower end."""
+    """Return distinct edges (n, 2), and for each vertex its edge, and if it is its lower end."""
     start, stop = mesh.vertex, mesh.vertex[next_vertex(mesh.ring_offsets)]
     key = np.minimum(start, stop) * mesh.points_um.shape[0] + np.maximum(start, stop)
     keys, edge = np.unique(key, return_inverse=True)
@@ -271,7 +271,7 @@ def _edges(mesh: _Mesh) -> tuple[Edges, Ints, Bools]:
 
 
 def _insert_points(mesh: _Mesh, tolerance_um: float) -> tuple[_Mesh, int]:
-    """Let edges pass through the points within the tolerance; return the number of these pairs."""
+    """Let edges pass through points within the tolerance; return the number of pairs."""
     edges, edge_of, is_forward = _edges(mesh)
     ends_um = mesh.points_um[edges]
     tree = shapely.STRtree(shapely.points(mesh.points_um))
@@ -315,8 +315,8 @@ def _crossings_um(mesh: _Mesh) -> Floats:
     return np.unique(begin_um[other][is_crossing] + fraction * across_um[is_crossing], axis=0)
 
 
-def _cross(a: Floats, b: Floats) -> Floats:
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+def _cross(u: Floats, v: Floats) -> Floats:
+    return np.asarray(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
 
 
 # -- gaps and overlaps ------------------------------------------------------------------------------------------------------
@@ -385,7 +385,7 @@ def _spread(rebuilt: Layout, is_rebuilt: Bools, plain: Layout) -> Layout:
 
 
 def _priority(polygons: NDArray[Any]) -> Ints:
-    """Return ranks (n,) by area, then by the centroid: the lowest one has the area of an overlap."""
+    """Return ranks (n,) by area, then centroid: the lowest one has the area of an overlap."""
     centroid = shapely.get_coordinates(shapely.centroid(polygons))
     order = np.lexsort((centroid[:, 1], centroid[:, 0], shapely.area(polygons)))
     rank = np.empty(order.size, np.int64)

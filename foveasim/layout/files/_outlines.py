@@ -1,4 +1,4 @@
-"""Outlines of other programs: units of length, parts, planes, and outlines that are invalid."""
+"""Outlines of other programs: units of length, parts, planes, and invalid outlines."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def agreed_unit(path: Path, unit: str | None, stated_um: float, name: str) -> fl
     return stated_um
 
 
-def check_plane(path: Path, z: NDArray[Any], largest: float) -> None:
+def check_plane(path: Path, z: NDArray[Any], extent: float) -> None:
     """Reject outlines that do not lie in a plane of constant z; NaN stands for no z."""
     z = z[np.isfinite(z)]
-    if z.size and float(np.ptp(z)) > FLAT * max(largest, float(np.abs(z).max())):
+    if z.size and float(np.ptp(z)) > FLAT * max(extent, float(np.abs(z).max())):
         raise FileError(
             path,
             f"has outlines at several z, from {z.min():g} to {z.max():g}; a layout is a plane: project the outlines onto it",

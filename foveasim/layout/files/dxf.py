@@ -150,12 +150,12 @@ class _Reader:
     """
     Outlines of the entities of a drawing.
 
-    ``names``: selected layers in lower case, or None. ``sagitta``: largest deviation of chords, in units of the drawing.
+    ``names``: selected layers in lower case, or None. ``tolerance``: largest deviation of chords, in units of the drawing.
     ``layers``: layers with outlines. ``unknown``: number of entities on selected layers that are no outlines, by kind.
     """
 
-    def __init__(self, names: frozenset[str] | None, sagitta: float) -> None:
-        self._names, self._sagitta = names, sagitta
+    def __init__(self, names: frozenset[str] | None, tolerance: float) -> None:
+        self._names, self._tolerance = names, tolerance
         self.layers: set[str] = set()
         self.unknown: Counter[str] = Counter()
         self._n_outlines = self._n_vertices = 0
@@ -163,7 +163,7 @@ class _Reader:
     def outlines(
         self, entities: Any, matrix: Floats, parent: str | None, depth: int
     ) -> Iterator[tuple[str, Any, list[float]]]:
-        """Yield the layer, polygon and heights of all outlines, transformed by a matrix (rows times matrix)."""
+        """Yield layer, polygon and heights of all outlines, as rows times a matrix."""
         if depth > MAX_DEPTH:
             raise FileError(None, f"has blocks nested more than {MAX_DEPTH} deep")
         for entity in entities:
@@ -188,9 +188,9 @@ class _Reader:
             self._count(rings)
             yield name, _shape(rings), [float(z) for ring in rings for z in (ring[:, 2].min(), ring[:, 2].max())]
 
-    def _count(self, rings: list[Floats]) -> None:
+    def _count(self, corners: list[Floats]) -> None:
         self._n_outlines += 1
-        self._n_vertices += sum(len(ring) for ring in rings)
+        self._n_vertices += sum(len(ring) for ring in corners)
         if self._n_outlines > MAX_SITES or self._n_vertices > MAX_VERTICES:
             raise FileError(None, f"has more than {MAX_VERTICES} vertices or {MAX_SITES} outlines")
 
@@ -223,11 +223,11 @@ class _Reader:
     def _rings(self, entity: Any, kind: str, matrix: Floats) -> list[Floats] | None:
         """Return the closed rings (n, 3) of an outline, or None."""
         scale = float(np.linalg.norm(matrix[:3, :3], axis=1).max())
-        sagitta = self._sagitta / scale if scale > 0.0 else self._sagitta
+        tolerance = self._tolerance / scale if scale > 0.0 else self._tolerance
         if kind in FILLED:
-            rings = _boundaries(entity, sagitta)
+            rings = _boundaries(entity, tolerance)
         elif kind in CURVES and not _width(entity, kind):
-            rings = [_curve(entity, kind, sagitta)]
+            rings = [_curve(entity, kind, tolerance)]
         else:
             return None
         if not rings or any(ring is None or len(ring) < 3 for ring in rings):
@@ -235,11 +235,11 @@ class _Reader:
         return [ring @ matrix[:3, :3] + matrix[3, :3] for ring in rings if ring is not None]
 
 
-def _curve(entity: Any, kind: str, sagitta: float) -> Floats | None:
+def _curve(entity: Any, kind: str, tolerance: float) -> Floats | None:
     """Return the corners (n, 3) of a closed curve, without the first one again, or None."""
     if kind == "LWPOLYLINE":
         points = np.array(entity.get_points(format="xyb"), np.float64).reshape(-1, 3)
-        return _in_world(entity, _with_arcs(points, entity.closed, sagitta), float(entity.dxf.get("elevation", 0.0)))
+        return _in_world(entity, _with_arcs(points, entity.closed, tolerance), float(entity.dxf.get("elevation", 0.0)))
     if kind == "POLYLINE":
         if not (entity.is_2d_polyline or entity.is_3d_polyline):
             return None  # meshes
@@ -248,32 +248,32 @@ def _curve(entity: Any, kind: str, sagitta: float) -> Floats | None:
         if entity.is_3d_polyline:
             return _closed(points[:, :3], entity.is_closed)
         elevation = float(entity.dxf.get("elevation", (0.0, 0.0, 0.0))[2])
-        return _in_world(entity, _with_arcs(points[:, (0, 1, 3)], entity.is_closed, sagitta), elevation)
+        return _in_world(entity, _with_arcs(points[:, (0, 1, 3)], entity.is_closed, tolerance), elevation)
     if kind in ("SOLID", "TRACE", "3DFACE"):
         # The corners of solids are in the order of two rows.
         corners = np.array([tuple(corner) for corner in entity.wcs_vertices()], np.float64)
         return _closed(corners, is_closed=True)
-    points = entity.flattening(sagitta)
+    points = entity.flattening(tolerance)
     return _closed(np.array([tuple(point) for point in points], np.float64), is_closed=False)
 
 
 def _closed(points: Floats, is_closed: bool) -> Floats | None:
-    """Return the corners of a closed outline, without the first one again; None where it is open."""
+    """Return the corners of an outline, without the first one again; None if it is open."""
     size = float(np.ptp(points, axis=0).max()) if len(points) > 1 else 0.0
     if size and np.abs(points[0] - points[-1]).max() <= CLOSED * size:
         return points[:-1]
     return points if is_closed else None
 
 
-def _in_world(entity: Any, points: Floats | None, elevation: float) -> Floats | None:
+def _in_world(entity: Any, points: Floats | None, height: float) -> Floats | None:
     """Return points (n, 2) of an entity's own plane as (n, 3) of the drawing."""
     if points is None or not len(points):
         return None
-    heights = np.full((len(points), 1), elevation)
+    heights = np.full((len(points), 1), height)
     return np.array([tuple(p) for p in entity.ocs().points_to_wcs(np.hstack((points, heights)).tolist())], np.float64)
 
 
-def _with_arcs(points: Floats, is_closed: bool, sagitta: float) -> Floats | None:
+def _with_arcs(points: Floats, is_closed: bool, tolerance: float) -> Floats | None:
     """
     Return the corners (n, 2) of a polyline whose arcs are chords.
 
@@ -289,7 +289,7 @@ def _with_arcs(points: Floats, is_closed: bool, sagitta: float) -> Floats | None
         if bulge and chord:
             radius = abs(chord) * (1.0 + bulge * bulge) / (4.0 * abs(bulge))
             angle = 4.0 * np.arctan(bulge)
-            step = 2.0 * np.arccos(max(1.0 - sagitta / radius, 0.0))
+            step = 2.0 * np.arccos(max(1.0 - tolerance / radius, 0.0))
             n = int(min(max(np.ceil(abs(angle) / step), 1), MAX_CHORDS))
             centre = start + 0.5 * chord * (1.0 + 1j * (1.0 - bulge * bulge) / (2.0 * bulge))
             corners += (centre + (start - centre) * np.exp(1j * angle * np.arange(n) / n)).tolist()
@@ -300,18 +300,18 @@ def _with_arcs(points: Floats, is_closed: bool, sagitta: float) -> Floats | None
     return np.stack((found.real, found.imag), axis=1)[kept]
 
 
-def _boundaries(hatch: Any, sagitta: float) -> list[Floats | None]:
+def _boundaries(hatch: Any, tolerance: float) -> list[Floats | None]:
     """Return the corners of the boundaries of a hatch."""
     elevation = float(hatch.dxf.get("elevation", (0.0, 0.0, 0.0))[2])
     found = []
     for boundary in hatch.paths:
         if hasattr(boundary, "vertices"):
             points = np.array(boundary.vertices, np.float64).reshape(-1, 3)
-            found.append(_with_arcs(points, True, sagitta))
+            found.append(_with_arcs(points, True, tolerance))
             continue
         corners: list[tuple[float, ...]] = []
         for edge in boundary.edges:
-            part = _edge(edge, sagitta)
+            part = _edge(edge, tolerance)
             if (
                 corners
                 and np.abs(np.subtract(corners[-1], part[0])).max() > np.abs(np.subtract(corners[-1], part[-1])).max()
@@ -322,7 +322,7 @@ def _boundaries(hatch: Any, sagitta: float) -> list[Floats | None]:
     return [_in_world(hatch, points, elevation) for points in found]
 
 
-def _edge(edge: Any, sagitta: float) -> list[tuple[float, float]]:
+def _edge(edge: Any, tolerance: float) -> list[tuple[float, float]]:
     """Return the points of an edge of a hatch in its plane."""
     from ezdxf.math import ConstructionArc
 
@@ -331,10 +331,10 @@ def _edge(edge: Any, sagitta: float) -> list[tuple[float, float]]:
         points = [edge.start, edge.end]
     elif kind == "ArcEdge":
         arc = ConstructionArc(edge.center, edge.radius, edge.start_angle, edge.end_angle)
-        points = list(arc.flattening(sagitta))
+        points = list(arc.flattening(tolerance))
     else:
         tool = edge.construction_tool()
-        points = list(tool.flattening(sagitta))
+        points = list(tool.flattening(tolerance))
     return [(float(point[0]), float(point[1])) for point in points]
 
 
@@ -349,9 +349,9 @@ def _width(entity: Any, kind: str) -> bool:
     return False
 
 
-def _shape(rings: list[Floats]) -> Any:
+def _shape(corners: list[Floats]) -> Any:
     """Return the polygon of a ring, or the area of several ones by the even-odd rule."""
-    polygons = [shapely.Polygon(ring[:, :2]) for ring in rings]
+    polygons = [shapely.Polygon(ring[:, :2]) for ring in corners]
     if len(polygons) == 1:
         return polygons[0]
     area = polygons[0]
@@ -370,6 +370,18 @@ def _is_dxf(_path: Path, head: bytes) -> bool:
     return lines[:2] == [b"0", b"SECTION"]
 
 
+def _example(path: Path) -> tuple[Layout, dict[str, Any]]:
+    groups = [0, "SECTION", 2, "ENTITIES"]
+    for x in (0.0, 3.0):
+        groups += [0, "POLYLINE", 8, "PIXEL", 66, 1, 70, 1, 10, 0.0, 20, 0.0, 30, 0.0]
+        for dx, dy in ((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0)):
+            groups += [0, "VERTEX", 8, "PIXEL", 10, x + dx, 20, dy, 30, 0.0]
+        groups += [0, "SEQEND", 8, "PIXEL"]
+    path.write_text("\n".join(map(str, [*groups, 0, "ENDSEC", 0, "EOF", ""])))
+    squares = Layout.from_rectangles([[1.0, 1.0], [4.0, 1.0]], 2.0, layer=np.array(["PIXEL", "PIXEL"]))
+    return squares, {"unit": "um"}
+
+
 FORMATS.register(
     "dxf",
     FileFormat(
@@ -379,4 +391,5 @@ FORMATS.register(
         read=read,
         read_options=("layer", "unit", "invalid", "parts", "max_sagitta_um"),
     ),
+    example=_example,
 )

@@ -194,7 +194,7 @@ def _geometry_column(path: Path, geo: Any) -> tuple[str, dict[str, Any]]:
 
 
 def _unit_um(path: Path, column: dict[str, Any], unit: LengthUnit | None) -> float:
-    """Return the unit of the coordinates in µm: that of the reference system, or the one that the caller states."""
+    """Return the unit of coordinates in µm: that of the reference system, or the stated one."""
     crs = column.get("crs", DEFAULT_CRS)
     if crs is None:
         return required_unit(path, unit, "has coordinates in an unknown reference system")
@@ -288,7 +288,7 @@ def _check_type(path: Path, pa: Any, kind: Any, encoding: str) -> None:
 
 
 def _geometries(pa: Any, column: Any, encoding: str) -> tuple[NDArray[Any], dict[int, str]]:
-    """Return polygons, multipolygons and None, and what the rows are whose geometry is not read."""
+    """Return polygons, multipolygons and None, and what is wrong with rows of None."""
     if encoding != "WKB":
         return _native(pa, column, NATIVE[encoding]), {}
     wkb = column.to_numpy(zero_copy_only=False)
@@ -335,7 +335,7 @@ def _dimension(number: int) -> int:
 
 
 def _native(pa: Any, column: Any, depth: int) -> NDArray[Any]:
-    """Return the geometries of nested lists of coordinates (GeoArrow, separate arrays of x and y)."""
+    """Return the geometries of nested lists of coordinates (GeoArrow)."""
     array = column.combine_chunks()
     array = array.chunk(0) if isinstance(array, pa.ChunkedArray) else array
     is_null = array.is_null().to_numpy(zero_copy_only=False)

@@ -1,5 +1,5 @@
 """
-Layouts as detectors in NeXus files (HDF5): NXoff_geometry, and the corners of pixels of pyFAI.
+Layouts as detectors in NeXus files (HDF5): NXoff_geometry, and pixel corners of pyFAI.
 
 A file contains one detector, with
 
@@ -136,7 +136,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
 
 
 def _write_corners(detector: Any, layout: Layout) -> None:
-    """Write the corners of the pixels as pyFAI does, except where padding would take far more memory than the vertices."""
+    """Write corners of pixels as pyFAI does, unless padding would take far more memory."""
     row, column = _rows_and_columns(layout)
     count = np.diff(layout.ring_offsets)
     n_corners = int(count.max(initial=3))
@@ -168,7 +168,7 @@ def _write_corners(detector: Any, layout: Layout) -> None:
 
 
 def _rows_and_columns(layout: Layout) -> tuple[Ints, Ints]:
-    """Return the position of each site in an array: rows and columns of a complete grid, otherwise one row."""
+    """Return the positions of sites in an array: a complete grid, otherwise one row."""
     row, column = (layout.columns.get(name) for name in ("row", "column"))
     if row is not None and column is not None and row.dtype.kind in "iu" and column.dtype.kind in "iu" and row.size:
         row, column = row.astype(np.int64) - int(row.min()), column.astype(np.int64) - int(column.min())
@@ -450,7 +450,7 @@ def _sources(file: Any) -> list[tuple[str, Any, Any]]:
 
 
 def _datasets(kind: str, part: Any, detector: Any) -> tuple[dict[str, Any], str]:
-    """Return the datasets that describe outlines, and their unit, empty where it is not stated."""
+    """Return the datasets that describe outlines, and their unit, empty if not stated."""
     import h5py
 
     if kind in ("faces", "offsets"):

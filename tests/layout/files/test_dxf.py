@@ -20,7 +20,7 @@ def test_arcs_of_bulges_have_exact_area(bulge, factor):
     # The bulge of a semicircle is 1, that of a quarter circle tan(22.5 degrees).
     radius = 1.0 if abs(bulge) == 1.0 else np.sqrt(2.0)
     points = np.array([(0.0, -1.0, bulge), (0.0, 1.0, 0.0), (-4.0, 1.0, 0.0), (-4.0, -1.0, 0.0)])
-    polygon = shapely.Polygon(_with_arcs(points, is_closed=True, sagitta=1e-6))
+    polygon = shapely.Polygon(_with_arcs(points, is_closed=True, tolerance=1e-6))
 
     assert polygon.area == pytest.approx(8.0 + factor * radius**2, abs=1e-4)
 
@@ -28,8 +28,8 @@ def test_arcs_of_bulges_have_exact_area(bulge, factor):
 def test_open_polylines_are_no_outlines():
     points = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0)])
 
-    assert _with_arcs(points, is_closed=False, sagitta=1e-3) is None
-    assert len(_with_arcs(np.vstack((points, points[:1])), is_closed=False, sagitta=1e-3)) == 3
+    assert _with_arcs(points, is_closed=False, tolerance=1e-3) is None
+    assert len(_with_arcs(np.vstack((points, points[:1])), is_closed=False, tolerance=1e-3)) == 3
 
 
 @pytest.mark.parametrize(
@@ -50,5 +50,5 @@ def test_drawings_are_detected(tmp_path, head, expected):
 def test_missing_ezdxf_gives_command(tmp_path, monkeypatch):
     (tmp_path / "a.dxf").write_text("  0\nSECTION\n  0\nENDSEC\n  0\nEOF\n")
     monkeypatch.setitem(sys.modules, "ezdxf", None)
-    with pytest.raises(FileError, match="needs ezdxf.*foveasim\\[dxf\\]"):
+    with pytest.raises(FileError, match=r"needs ezdxf.*foveasim\[dxf\]"):
         fs.read_layout(tmp_path / "a.dxf")
