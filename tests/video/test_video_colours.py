@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import foveasim as fs
-from foveasim._io.videos import VideoFile
+from foveasim._io.videos import VideoFile, frame_pixels
 from foveasim._io.videos.colours import HLG_A, Colour
-from foveasim._io.videos.pixels import pixels_of_frame, turned
+from foveasim._io.videos.files import Decoded
+from foveasim._io.videos.pixels import check_frame, pixels_of_frame, turned
 from foveasim.errors import FileError
 from foveasim.scene import Scene
 from foveasim.units import decode_srgb, encode_srgb
@@ -346,8 +347,48 @@ def test_cover_art_is_not_a_video():
         assert _is_cover(Cover)
 
 
+@pytest.mark.parametrize("name", ["a.webp", "a.apng"])
+def test_other_colour_profiles_are_named(tmp_path, name):
+    from PIL import Image, ImageCms
+
+    images = [Image.fromarray(np.full((32, 48, 3), v, np.uint8)) for v in (30, 90)]
+    options = {"save_all": True, "append_images": images[1:], "duration": 100, "lossless": True}
+    options |= {"format": "PNG" if name == "a.apng" else "WEBP"}
+    for profile in ("sRGB", "LAB"):
+        content = ImageCms.ImageCmsProfile(ImageCms.createProfile(profile)).tobytes()
+        images[0].save(tmp_path / name, icc_profile=content, **options)
+        footage = FrameSource(tmp_path / name, **LIGHT)
+        assert footage.times_s.tolist() == pytest.approx([0.0, 0.1])
+        if profile == "sRGB":
+            assert len(list(footage)) == 2
+        else:
+            with pytest.raises(FileError, match=r"has the colour profile 'Lab.*'; convert it to sRGB, or specify"):
+                list(footage)
+            assert len(list(FrameSource(tmp_path / name, encoding="linear", **LIGHT))) == 2
+
+
+def test_stereoscopic_and_spherical_frames_are_named(tmp_path):
+    frame = uniform_frame("gray", [3])
+    check_frame(tmp_path, frame, {"STEREO3D": bytes(12), "DISPLAYMATRIX": bytes(36)})
+    with pytest.raises(FileError, match="is stereoscopic"):
+        check_frame(tmp_path, frame, {"STEREO3D": bytes([1, 0, 0, 0, 0, 0, 0, 0])})
+    with pytest.raises(FileError, match="is spherical"):
+        check_frame(tmp_path, frame, {"SPHERICAL": bytes(40)})
+
+
+def test_dolby_vision_needs_another_transfer(tmp_path):
+    frame = uniform_frame("yuv420p10le", [300, 512, 512])
+    for transfer, is_valid in ((2, False), (18, True)):
+        decoded = Decoded(frame, Colour(tmp_path, transfer, 2), {"DOVI_METADATA": b""})
+        if is_valid:
+            assert frame_pixels(tmp_path, decoded).dtype == np.uint16
+        else:
+            with pytest.raises(FileError, match="is in Dolby Vision without another transfer"):
+                frame_pixels(tmp_path, decoded)
+
+
 def test_frames_without_matrix_are_unchanged(tmp_path):
     frame = uniform_frame("gray", [3])
     pixels = pixels_of_frame(tmp_path, frame)
 
-    assert turned(tmp_path, frame, pixels) is pixels
+    assert turned(tmp_path, pixels, None) is pixels

@@ -7,6 +7,7 @@ limited range of luma and chroma, full range of grey and RGB, and pictures in sR
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats
-from foveasim.errors import FileError
+from foveasim.errors import FileError, printable
 from foveasim.units import decode_srgb, encode_srgb
 
 UNSPECIFIED = 2
@@ -123,6 +124,26 @@ class Colour:
         else:
             found[..., :n_colours] = _srgb_table(self.transfer, peak)[channels[..., :n_colours]]
         return found[..., 0] if pixels.ndim == 2 else found
+
+
+def check_profile(path: Path, profile: bytes | None) -> None:
+    """
+    Check that a colour profile (ICC) of a frame is that of sRGB, or None.
+
+    Raises FileError when it is another one.
+    """
+    if profile is None:
+        return
+    from PIL import ImageCms
+
+    try:
+        name = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(profile))).strip()
+    except (OSError, ImageCms.PyCMSError):
+        name = "is not readable"
+    if "srgb" not in name.lower():
+        raise FileError(
+            path, f"has the colour profile '{printable(name):.60}'; convert it to sRGB, or specify the encoding"
+        )
 
 
 @lru_cache(maxsize=4)

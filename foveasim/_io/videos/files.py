@@ -8,7 +8,7 @@ What would change the values otherwise is named in an error.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -22,9 +22,9 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats
 from foveasim._io.images import check_picture_size
 from foveasim._io.sandbox import iterate_in_sandbox, read_in_sandbox
-from foveasim._io.videos.colours import Colour
+from foveasim._io.videos.colours import UNSPECIFIED, Colour, check_profile
 from foveasim._io.videos.pixels import check_frame, pixels_of_frame, turned
-from foveasim._io.videos.webp import WebPAnimation, is_webp
+from foveasim._io.videos.webp import WebPAnimation, WebPFrame, is_webp
 from foveasim.errors import FileError, printable
 
 KIND = "a video"
@@ -34,15 +34,18 @@ MAX_BYTES = 2**32
 DECODE_TIMES = ("avi",)
 #: Range of the errors of rounded time stamps, in units of their resolution.
 ROUNDED_TICKS = 1.0 - 1e-6
+#: Codecs of PNG pictures.
+PNG_CODECS = ("apng", "png")
 #: Bit of the first byte of a VP8 frame that is shown.
 VP8_SHOWN = 0x10
 
 
 class Decoded(NamedTuple):
-    """A decoded frame of PyAV, with the transfer and primaries of its colours."""
+    """A decoded frame of PyAV, with transfer and primaries of its colours and other data."""
 
     frame: Any
     colour: Colour
+    data: Mapping[str, bytes]
 
 
 class VideoFile:
@@ -82,7 +85,9 @@ class VideoFile:
                 transfer, primaries = (
                     int(getattr(frame, name, getattr(codec, name))) for name in ("color_trc", "color_primaries")
                 )
-                yield Decoded(frame, Colour(self.path, transfer, primaries))
+                with _as_video_error(self.path, "has unknown data in its frames"):
+                    data = self._data_of(frame, codec.name)
+                yield Decoded(frame, Colour(self.path, transfer, primaries), data)
                 n_read += 1
         if n_read == 0:
             raise FileError(self.path, "contains no frames")
@@ -138,6 +143,23 @@ class VideoFile:
                 return np.asarray(count * (1.0 / rate))
         return np.asarray(times_s)
 
+    def _data_of(self, frame: Any, codec: str) -> Mapping[str, bytes]:
+        """Return data of a frame by their names in FFmpeg, such as the display matrix."""
+        if codec in PNG_CODECS:  # PyAV 18 frees the metadata of colour profiles of PNG twice
+            return {} if self._png_profile is None else {"ICC_PROFILE": self._png_profile}
+        return {str(each.type).rpartition(".")[2]: bytes(each) for each in frame.side_data}
+
+    @cached_property
+    def _png_profile(self) -> bytes | None:
+        """Colour profile (ICC) of an animated PNG file, None without it."""
+        from PIL import Image
+
+        try:
+            with Image.open(self.path, formats=("PNG",)) as image:
+                return image.info.get("icc_profile")
+        except Exception:  # noqa: BLE001 -- PNG pictures in another container
+            return None
+
     def _check_time(self, number: int, frame: Any) -> None:
         """Check that a decoded frame has the time stamp of its packet, if these have been read."""
         if "times_s" not in self.__dict__ or self._ticks is None:
@@ -146,7 +168,7 @@ class VideoFile:
             raise FileError(self.path, f"has another time stamp in frame {number} than in its packet; encode it again")
 
 
-def frame_pixels(path: Path, decoded: Decoded | NDArray[Any], *, is_encoded: bool = True) -> NDArray[Any]:
+def frame_pixels(path: Path, decoded: Decoded | WebPFrame, *, is_encoded: bool = True) -> NDArray[Any]:
     """
     Return the pixels of a decoded frame: upright, top row first.
 
@@ -155,16 +177,23 @@ def frame_pixels(path: Path, decoded: Decoded | NDArray[Any], *, is_encoded: boo
     is checked before memory is allocated, because corrupt files may claim any size. Raises FileError when the frame is corrupt,
     too large, or has a property that is not supported.
     """
-    if isinstance(decoded, np.ndarray):
-        return decoded
-    frame, colour = decoded
+    if isinstance(decoded, WebPFrame):
+        if is_encoded:
+            check_profile(path, decoded.profile)
+        return decoded.pixels
+    frame, colour, data = decoded
     check_picture_size(path, frame.width, frame.height)
-    check_frame(path, frame)
+    check_frame(path, frame, data)
     with _as_video_error(path, "is corrupt"):
         pixels = pixels_of_frame(path, frame)
         if is_encoded:
+            check_profile(path, data.get("ICC_PROFILE"))
+            if colour.transfer == UNSPECIFIED and "DOVI_METADATA" in data:
+                raise FileError(
+                    path, "is in Dolby Vision without another transfer; convert it, or specify the encoding"
+                )
             pixels = colour.to_srgb(pixels)
-        return turned(path, frame, pixels)
+        return turned(path, pixels, data.get("DISPLAYMATRIX"))
 
 
 def _ascending(ticks: Any) -> NDArray[np.int64] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,20 @@ DEPTHS = (8, 9, 10, 12, 14, 16)
 ONE = 1 << 16
 
 
-def check_frame(path: Path, frame: Any) -> None:
+def check_frame(path: Path, frame: Any, data: Mapping[str, bytes]) -> None:
     """
-    Check that a frame shows one moment.
+    Check that a frame is one flat picture of one moment.
 
-    Raises FileError when it is interlaced.
+    ``data``: data of the frame by their names in FFmpeg. Raises FileError when it is interlaced, stereoscopic or spherical.
     """
     if frame.interlaced_frame:
         raise FileError(path, "is interlaced; deinterlace it, for example with: ffmpeg -i IN -vf bwdif OUT")
+    if any(data.get("STEREO3D", b"")[:4]):
+        raise FileError(
+            path, "is stereoscopic; extract one of the two pictures, for example with: ffmpeg -i IN -vf stereo3d=OUT"
+        )
+    if "SPHERICAL" in data:
+        raise FileError(path, "is spherical; project it, for example with: ffmpeg -i IN -vf v360=e:flat OUT")
 
 
 def pixels_of_frame(path: Path, frame: Any) -> NDArray[Any]:
@@ -139,17 +146,16 @@ def _rounded(values: NDArray[Any], bits: int) -> NDArray[Any]:
     return np.rint(np.clip(values, np.float32(0.0), np.float32(1.0)) * peak).astype(dtype)
 
 
-def turned(path: Path, frame: Any, pixels: NDArray[Any]) -> NDArray[Any]:
+def turned(path: Path, pixels: NDArray[Any], matrix: bytes | None) -> NDArray[Any]:
     """
     Return pixels turned and mirrored by the display matrix of the file, as phones write it.
 
     Raises FileError when the matrix is another one.
     """
-    found = next((data for data in frame.side_data if "DISPLAYMATRIX" in str(data.type)), None)
-    if found is None:
+    if matrix is None:
         return pixels
     # x' = a x + c y, y' = b x + d y, with y downwards.
-    a, b, _, c, d = np.frombuffer(bytes(found), np.int32)[:5].tolist()
+    a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5].tolist()
     if {abs(a), abs(d)} == {ONE} and b == c == 0:
         return pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
     if {abs(b), abs(c)} == {ONE} and a == d == 0:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats
-from foveasim._io.images import check_picture_size
+from foveasim._io.images import check_picture_size, pixels_of_image
 from foveasim.errors import FileError
 
 #: Shortest time of a frame that browsers show, and the time that they use for shorter ones, in s.
@@ -22,9 +22,19 @@ MAX_FILE_BYTES = 1 << 31
 
 def is_webp(path: Path) -> bool:
     """Return whether a file is a WebP picture or animation."""
-    with path.open("rb") as file:
-        head = file.read(12)
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+    except OSError:  # reported by the reader of other videos
+        return False
     return head[:4] == b"RIFF" and head[8:12] == b"WEBP"
+
+
+class WebPFrame(NamedTuple):
+    """Pixels of a frame, upright, and its colour profile (ICC)."""
+
+    pixels: NDArray[Any]
+    profile: bytes | None
 
 
 class WebPAnimation:
@@ -39,7 +49,7 @@ class WebPAnimation:
         durations_s = _durations_s(path)
         self.times_s: Floats = np.concatenate(([0.0], np.cumsum(durations_s)[:-1]))
 
-    def __iter__(self) -> Iterator[NDArray[Any]]:
+    def __iter__(self) -> Iterator[WebPFrame]:
         from PIL import Image
 
         n_read = 0
@@ -49,7 +59,7 @@ class WebPAnimation:
                 n_frames = getattr(image, "n_frames", 1)
                 for n_read in range(n_frames):
                     image.seek(n_read)
-                    yield np.asarray(image)
+                    yield WebPFrame(pixels_of_image(image), image.info.get("icc_profile"))
         except FileError:
             raise
         except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on corrupt files
