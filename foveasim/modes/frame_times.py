@@ -60,7 +60,7 @@ class FrameTimes:
 
     def last_before(self, time_s: float, first: int, rounding: float) -> int:
         """
-        Return the last frame that begins before a time, counted from ``first``; -1 if none does.
+        Return the last frame that begins before a time, from ``first`` on; -1 if none does.
 
         ``time_s``: after the frame ``first``. ``rounding``: tolerance as a fraction of the time between frames.
         """

@@ -120,6 +120,8 @@ def arguments_of(kind, **given):
     }
     if kind is fs.sensor.PassBand:
         required["to_nm"] = 600.0
+    if kind is fs.modes.Shutter:
+        required["frame_s"] = 0.1
     if issubclass(kind, fs.sensor.effects.Effect) and "fraction" in required:
         required["fraction"] = 0.1
     return required | next((COMPANIONS[name] for name in given if name in COMPANIONS), {}) | given
