@@ -39,6 +39,7 @@ def test_flipped_bits_give_frames_or_file_errors(tmp_path, name, codec):
             footage = FrameSource(bad, **SCENE)
             n_read += sum(scene.basis.size > 0 for scene in footage)
             assert footage.frame_s is None or footage.frame_s > 0.0
+            assert np.all(np.diff(footage.times_s) > 0.0)
         except FileError as error:
             messages.add(str(error).removeprefix(f"{bad}: "))
 
