@@ -13,6 +13,7 @@ import shapely
 from registries import restored
 
 import foveasim as fs
+from foveasim._core.extras import EXTRA_OF
 from foveasim.columns import COLUMNS
 from foveasim.distortion import LENSES
 from foveasim.errors import ParameterError
@@ -34,7 +35,6 @@ from foveasim.scene import CUBE_FORMATS, SCENES
 from foveasim.sensor import PIXEL_OPTICS, Footprints, PixelOptics
 from foveasim.sensor.effects import EFFECTS, AdditiveNoise, Effect, FixedFactor, FixedOffset
 from foveasim.sensor.spectral import CURVES
-from foveasim._core.extras import EXTRA_OF
 from foveasim.testing import check_all, check_extension, extensions
 
 REGISTRIES = (

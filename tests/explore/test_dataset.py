@@ -30,13 +30,13 @@ from waiting import DEADLINE_S
 import foveasim as fs
 from foveasim import explore
 from foveasim._io.images import write_picture
-from foveasim.units import decode_srgb
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, CoverageWarning, FileError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore.datasets import store
 from foveasim.explore.datasets.labels import boxes_on_sites, flow_on_sites, mask_on_sites
 from foveasim.explore.datasets.pictures import source_of
 from foveasim.explore.datasets.pytorch import _dataset_class
+from foveasim.units import decode_srgb
 
 SHOT = {
     "scene": {

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats
-from foveasim._io.images import check_picture_size, pixels_of_image
+from foveasim._io.images import check_picture_size
+from foveasim._io.images._pillow import picture_of_image
 from foveasim.errors import FileError
 
 #: Shortest time of a frame that browsers show, and the time that they use for shorter ones, in s.
@@ -59,7 +60,7 @@ class WebPAnimation:
                 n_frames = getattr(image, "n_frames", 1)
                 for n_read in range(n_frames):
                     image.seek(n_read)
-                    yield WebPFrame(pixels_of_image(image), image.info.get("icc_profile"))
+                    yield WebPFrame(picture_of_image(image).values(), image.info.get("icc_profile"))
         except FileError:
             raise
         except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on corrupt files
