@@ -19,9 +19,10 @@ def xyz_of_xy(xy: Floats) -> Floats:
 
 def xyz_of_primaries(xy: Floats) -> Floats:
     """
-    Return the tristimulus values (3, 3) of linear red, green and blue, one per row, whose sum is white.
+    Return the tristimulus values (3, 3) of linear red, green and blue, one per row.
 
-    ``xy`` (4, 2): chromaticities of red, green, blue and white. Raises LinAlgError when the primaries are on a line.
+    Their sum is white. ``xy`` (4, 2): chromaticities of red, green, blue and white. Raises LinAlgError when the primaries are
+    on a line.
     """
     xyz = xyz_of_xy(xy)
     return np.asarray(np.linalg.solve(xyz[:3].T, xyz[3])[:, np.newaxis] * xyz[:3])

@@ -781,7 +781,7 @@ def _framing_conflict(name: str, value: object, other: str) -> ParameterError:
 
 
 def _relative_radiance(picture: EncodedPicture, *, has_alpha: bool) -> Images:
-    """Return the relative radiance (n_channel, n_y, n_x) float32, multiplied by alpha; negative outside sRGB."""
+    """Return the relative radiance (n_channel, n_y, n_x) float32, multiplied by alpha."""
     pixels, encoding = picture.pixels, picture.encoding
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.bool_:

@@ -351,7 +351,7 @@ def test_profile_without_imagecodecs_names_the_extra(tmp_path, monkeypatch):
     [(P3_PROFILE, 3), (CMYK_PROFILE, 4), (icc.grey_profile(2.2), 1)],
     ids=["rgb", "cmyk", "grey"],
 )
-def test_flipped_bits_of_profile_give_light_or_error(profile, n_channels):
+def test_flipped_profile_gives_light_or_error(profile, n_channels):
     rng = np.random.default_rng(7)
     pixels = np.zeros((2, 3, 4), np.uint8)[..., :n_channels] if n_channels > 1 else np.zeros((2, 3), np.uint8)
     n_found = 0

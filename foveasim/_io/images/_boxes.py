@@ -16,7 +16,7 @@ JP2_SRGB, JP2_CMYK = (16, 17, 18), 12
 
 
 def jp2_colour(content: bytes) -> Colour:
-    """Return the colours of a JPEG 2000 file: those of its first colour box, as readers must; sRGB for a codestream."""
+    """Return the colours of the first colour box of a JPEG 2000 file; sRGB without one."""
     for body in _bodies(content, JP2_PATH):
         method = body[0] if body else 0
         if method == 1 and len(body) >= 7:

@@ -55,7 +55,7 @@ OETF = {"bt709": (0.09929682680944, 0.018053968510807, 4.5), "smpte240m": (0.111
 @dataclass(frozen=True, kw_only=True)
 class Colour:
     """
-    How the numbers of a picture encode light.
+    Relation between the numbers of a picture and light.
 
     ``transfer``: ``"srgb"``, ``"linear"``, ``"bt709"``, ``"smpte240m"``, ``"st428"``, a gamma (light is the value to this
     power), or a table (1 or 3, 2**bits) of the light of each integer. ``primaries``: chromaticities x and y of red, green, blue
@@ -111,7 +111,7 @@ class EncodedPicture:
 
 
 def h273_colour(primaries: int, transfer: int) -> Colour:
-    """Return the colours of the codes of primaries and transfer characteristics of Rec. ITU-T H.273."""
+    """Return the colours of the codes of primaries and transfer of Rec. ITU-T H.273."""
     if transfer in HDR_TRANSFERS:
         return Colour(problem=f"has the transfer function {HDR_TRANSFERS[transfer]}, whose white is not defined")
     if transfer not in H273_TRANSFERS or primaries not in H273_PRIMARIES:
@@ -159,7 +159,7 @@ def encoded_picture(found: FilePicture, encoding: FileEncoding) -> EncodedPictur
 
 
 def without_inks(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Return red, green and blue of cyan, magenta, yellow and black, as the light that ideal inks leave."""
+    """Return red, green and blue as the light that four ideal inks leave."""
     peak = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
     light = (peak - pixels[..., :3].astype(np.float64)) * (peak - pixels[..., 3:]) / peak
     return np.rint(light).astype(pixels.dtype) if pixels.dtype.kind == "u" else light.astype(pixels.dtype)
@@ -186,7 +186,7 @@ def _space_to_srgb(colour: Colour, n_colours: int) -> Callable[[NDArray[Any]], N
 
 
 def _matrix(colour: Colour) -> Floats:
-    """Return the matrix (3, 3) that linear colours in rows are multiplied by, to become linear sRGB."""
+    """Return the matrix (3, 3) from linear colours in rows to linear sRGB."""
     xy = SRGB_XY if colour.primaries is None else np.reshape(colour.primaries, (4, 2))
     neutral = xy[3:] if colour.neutral is None else np.reshape(colour.neutral, (1, 2))
     try:

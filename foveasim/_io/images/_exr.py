@@ -1,5 +1,5 @@
 """
-OpenEXR pictures: linear by definition of the format, in the primaries of Rec. ITU-R BT.709 or those of the file.
+OpenEXR pictures: linear light in the primaries of Rec. ITU-R BT.709 or of the file.
 
 The picture is the display window; pixels outside the data window are black. Colours are multiplied by alpha
 ("premultiplied"), so that the light is that of the colours alone, and alpha is not read. The picture is that of the channels

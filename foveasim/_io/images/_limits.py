@@ -1,4 +1,4 @@
-"""Names and limits of picture files, and what all formats share: size, orientation, square pixels."""
+"""Names of picture files, and checks of all formats: size, orientation, square pixels."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """
-Pictures that Pillow reads: JPEG, PNG of 8 bits, WebP, BMP, GIF, PPM, PFM, JPEG 2000, TGA, AVIF; and its images.
+Pictures that Pillow reads, and its images.
 
-Colours by format, where nothing else is stated sRGB:
+Formats: JPEG, PNG of 8 bits, WebP, BMP, GIF, PPM, PFM, JPEG 2000, TGA, AVIF. Their colours, where nothing else is stated
+sRGB:
 
 - all: ICC profiles;
 - JPEG: Adobe RGB by the interoperability index R03 of EXIF (DCF 2.0); CMYK by its profile, inverted as Adobe stores it;

@@ -1,5 +1,5 @@
 """
-PNG files: chunks, their checksums, and colours as in the PNG specification (third edition).
+PNG files: chunks, their checksums, and colours (PNG specification, third edition).
 
 Of the chunks about colours, cICP takes precedence over iCCP, iCCP over sRGB, and sRGB over gAMA and cHRM. Ancillary chunks
 that are not known are ignored, as the format permits; critical ones are rejected.

@@ -1,7 +1,8 @@
 """
-ICC profiles of pictures, by littleCMS: in Pillow for the question whether a profile is sRGB, in imagecodecs for conversions.
+ICC profiles of pictures, by littleCMS.
 
-The intent is relative colorimetric without black point compensation: the white of the profile becomes the white of sRGB.
+Pillow answers whether a profile is sRGB; imagecodecs converts others, with floating-point numbers. The intent is relative
+colorimetric without black point compensation: the white of the profile becomes the white of sRGB.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ _conversions = BoundedCache(16)
 
 def profile_to_srgb(profile: bytes, n_colours: int) -> Conversion | None:
     """
-    Return the conversion of pixels to linear sRGB, float32, beyond 0 to 1 for other colours; None if the profile is sRGB.
+    Return the conversion of pixels to linear sRGB; None if the profile is sRGB.
+
+    The result is float32, beyond 0 to 1 for colours outside sRGB.
 
     ``n_colours``: 1 for grey, 3 for colour and 4 for inks. Raises FormatError when the profile is broken, is that of another
     colour space, or needs imagecodecs.
@@ -99,7 +102,7 @@ def _title(profile: bytes) -> str | None:
 
 
 def _is_srgb(profile: bytes, n_channels: int) -> bool:
-    """Return whether a profile gives the codes of sRGB to rounding, for greys and a lattice of colours."""
+    """Return whether a profile gives the codes of sRGB for greys and a lattice of colours."""
     from PIL import Image, ImageCms
 
     levels = np.arange(0, 256, 17, dtype=np.uint8)
@@ -148,8 +151,9 @@ def _evaluation(imagecodecs: Any, profile: bytes, space: str) -> Evaluation:
 
 
 def _matrix(evaluate: Evaluation) -> Floats | None:
-    """Return linear sRGB (3, 3) of red, green and blue if a profile consists of curves and a matrix, else None."""
-    samples = np.random.default_rng(0).random((64, 3))
+    """Return linear sRGB (3, 3) of the primaries of curves and a matrix; None for tables."""
+    levels = (0.05, 0.3, 0.6, 0.95)
+    samples = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(-1, 3)
     matrix = evaluate(np.eye(3)) - evaluate(np.zeros((1, 3)))
     if np.abs(evaluate(np.zeros((1, 3)))).max() > MATRIX_TOLERANCE or np.abs(matrix).sum(axis=1).min() <= 0.0:
         return None

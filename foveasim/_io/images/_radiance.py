@@ -1,5 +1,5 @@
 """
-Radiance HDR pictures, as the manual of Radiance defines their header ("File Formats", section on pictures).
+Radiance HDR pictures, with the header of the manual of Radiance ("File Formats").
 
 Values are divided by all EXPOSURE and COLORCORR of the header, so that they are the radiance of the scene; OpenCV, imageio
 and imagecodecs ignore both. Without PRIMARIES the primaries are those of sRGB, as other programs mean them (Radiance: white

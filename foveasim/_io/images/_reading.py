@@ -34,7 +34,7 @@ HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"
 
 def read_picture(path: str | Path) -> NDArray[Any]:
     """
-    Read the stored values of a picture file, such as classes or transmittances; for light see :func:`as_encoded`.
+    Read the stored values of a picture file; for light see :func:`as_encoded`.
 
     ``path``: PNG, JPEG, TIFF, WebP, BMP, GIF, PPM, JPEG 2000, AVIF; with the extra ``pictures`` also Radiance HDR, EXR, HEIC,
     and camera raw files, which are demosaiced with the white balance of the camera and encoded in sRGB. Returns ``picture``
@@ -51,12 +51,12 @@ def read_picture(path: str | Path) -> NDArray[Any]:
 
 def as_encoded(picture: Any, encoding: FileEncoding = "auto") -> EncodedPicture:
     """
-    Return a picture in sRGB primaries with the encoding of its values: the one place that decides it.
+    Return a picture in sRGB primaries with its encoding, which is decided here alone.
 
     ``picture``: path, image of Pillow, array, or a result of this function, which is returned unchanged. ``encoding``: "auto"
-    is what the file states (profiles, gamma, primaries), or its format defines: linear for EXR, Radiance HDR, PFM and
-    floating-point TIFF, sRGB for all others, and for arrays; linear for images of Pillow of the mode F; every other encoding replaces this. Raises FileError for files,
-    and ParameterError for None and for data that are not a picture.
+    is what the file states (profiles, gamma, primaries), or its format defines: linear for EXR, Radiance HDR, PFM,
+    floating-point TIFF, and images of Pillow of the mode F; sRGB for all others, and for arrays. Every other encoding replaces
+    this. Raises FileError for files, and ParameterError for None and for data that are not a picture.
     """
     if isinstance(picture, EncodedPicture):
         return picture

@@ -113,7 +113,7 @@ def read_tiff(path: Path) -> FilePicture:
 
 
 def _check_tags(page: Any, *, has_inks: bool) -> None:
-    """Reject tags that change the meaning of pixels and are not known, and pixels that are not square."""
+    """Reject tags that change pixels and are not known, and pixels that are not square."""
     peak = 2 ** int(np.max(page.bitspersample)) - 1
     for tag in page.tags:
         if tag.code in REJECTED:
@@ -192,7 +192,7 @@ def _stored_codes(page: Any) -> set[int]:
 
 
 def _transfer_tables(page: Any, picture: NDArray[Any]) -> NDArray[Any] | None:
-    """Return the light of each integer by TransferFunction, (1 or 3, 2**bits); None if the tag is broken."""
+    """Return the light of integers by TransferFunction, (1 or 3, 2**bits); None if broken."""
     values = np.atleast_1d(np.asarray(page.tags[TRANSFER_FUNCTION].value))
     n = int(np.iinfo(picture.dtype).max) + 1 if picture.dtype.kind == "u" else 2
     if (

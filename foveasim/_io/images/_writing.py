@@ -1,4 +1,4 @@
-"""Writing of picture files: integers in sRGB or linear, floating-point numbers linear, as readers expect them."""
+"""Writing of picture files: integers in sRGB or marked as linear, linear floats."""
 
 from __future__ import annotations
 
