@@ -660,6 +660,48 @@ def video(
 
 
 @app.command()
+def events(
+    recording: Annotated[
+        Path, typer.Argument(help="Events: .raw, .dat, .aedat4, .aedat, .h5, .npy, .npz, or .txt with lines t x y p.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="File to write: .npz, .h5, .npy or .txt; without it, print a summary."),
+    ] = None,
+    layout: Annotated[Path | None, typer.Option("--layout", help=f"One site for each pixel: {LAYOUT_HELP}")] = None,
+    pitch_um: Annotated[
+        float | None, typer.Option("--pitch-um", help="Pixel pitch in µm, for a grid of the sensor size.")
+    ] = None,
+    time_unit: Annotated[
+        str | None, typer.Option("--time-unit", help="Unit of times in text: s, ms, us or ns.")
+    ] = None,
+    origin: Annotated[str, typer.Option("--origin", help="Time 0: file or first_event.")] = "file",
+    ignore: Annotated[
+        list[str] | None, typer.Option("--ignore", help="Unknown header or array that does not matter; repeatable.")
+    ] = None,
+) -> None:
+    """Read events of an event camera, and write them on photosites."""
+    from foveasim.config import read_any_layout
+    from foveasim.modes import Events
+
+    with _status("reading events"):
+        found = Events.read(
+            recording,
+            None if layout is None else read_any_layout(layout).layout,
+            pitch_um=pitch_um,
+            time_unit=cast("Any", time_unit),
+            origin=cast("Any", origin),
+            ignore=ignore or (),
+        )
+    n_on = int((found.polarity > 0).sum())
+    span = f", from {found.t_s[0]:.6f} to {found.t_s[-1]:.6f} s" if len(found) else ""
+    _report(f"{len(found):,} events of {found.layout.n_sites:,} photosites, {n_on:,} of them ON{span}")
+    if out is not None:
+        found.save(out)
+        _report(f"wrote {out}")
+
+
+@app.command()
 def schema(
     kind: Annotated[str, typer.Argument(help=f"Kind of file: {KINDS}.")] = "shot",
 ) -> None:

@@ -13,6 +13,7 @@ EXTRA_OF = {
     module: extra
     for extra, modules in {
         "adapters": ("deepinv", "torchvision"),
+        "events": ("aedat",),
         "explore": (
             "cloudpickle",
             "cryptography",

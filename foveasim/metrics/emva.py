@@ -298,7 +298,7 @@ def emva1288(
     )
     noise_e = np.sqrt(np.maximum(noise_dn2, MIN_DARK_DN2)) / gain_dn_per_e
     dark_spatial_dn2 = unlit[2][:, dark_half, i_class]
-    images = _images(frames, dark, half, dark_half, _relative_photons(photons, groups, half))
+    images = _images(frames, dark, half, dark_half, _ratios(photons, groups, half))
     bright_spatial_dn2 = lit[2][:, half, i_class].copy()
     for k, (bright, _) in enumerate(images):
         bright_spatial_dn2[:, k] = (groups.subset_variances(bright.mean_dn) - groups.subset_means(bright.noise_dn2))[
@@ -336,7 +336,7 @@ def emva1288(
     estimates: dict[str, NDArray[Any]] = {
         **{name: values[0] for name, values in subsets.items()},
         **{name: _root(values[0]) for name, values in squares.items()},
-        **{name: _root(values) for name, values in parts.squares.items()},
+        **{name: _root(values) for name, values in parts.values.items()},
         "is_quantisation_limited": noise_dn2[0] < MIN_DARK_DN2,
         "saturation_ph": level_ph[0, i_saturation, i_class],
         "linearity_error_min_fraction": _extreme(np.min, deviation[0], is_compared),
@@ -371,9 +371,9 @@ def emva1288(
     )
 
 
-def _root(squares: Floats) -> Floats:
+def _root(values: Floats) -> Floats:
     """Return square roots, NaN of negative numbers."""
-    return np.sqrt(np.where(squares >= 0.0, squares, np.nan))
+    return np.sqrt(np.where(values >= 0.0, values, np.nan))
 
 
 def _check_layout(layout: Layout, groups: SiteClasses) -> Layout:
@@ -383,8 +383,8 @@ def _check_layout(layout: Layout, groups: SiteClasses) -> Layout:
     return layout
 
 
-def _relative_photons(photons: ArrayLike, groups: SiteClasses, half: Ints) -> list[Floats | None]:
-    """Return the photons of each site over the mean of its class at the level of the PRNU of each class."""
+def _ratios(photons: ArrayLike, groups: SiteClasses, half: Ints) -> list[Floats | None]:
+    """Return photons over their mean, at the level of the PRNU of each class."""
     values = finite_array("photons", photons, at_least=0.0)
     if values.ndim == 1:
         return [None] * half.size
@@ -399,12 +399,12 @@ def _relative_photons(photons: ArrayLike, groups: SiteClasses, half: Ints) -> li
 
 
 def _images(
-    frames: Sequence[Any], dark: Sequence[Any], half: Ints, dark_half: Ints, relative_photons: Sequence[Floats | None]
+    frames: Sequence[Any], dark: Sequence[Any], half: Ints, dark_half: Ints, ratio: Sequence[Floats | None]
 ) -> list[tuple[MeanImage, MeanImage]]:
     """Return the bright and the dark mean image of each class at the level of its PRNU."""
     known: dict[tuple[int, int], tuple[MeanImage, MeanImage]] = {}
     images = []
-    for level, dark_level, relative in zip(half.tolist(), dark_half.tolist(), relative_photons, strict=True):
+    for level, dark_level, relative in zip(half.tolist(), dark_half.tolist(), ratio, strict=True):
         if relative is not None:
             images.append((mean_image(frames[level], dark[dark_level], relative), mean_image(dark[dark_level])))
             continue

@@ -38,23 +38,23 @@ MARGIN = SMOOTHING.size // 2
 
 
 class MeanImage(NamedTuple):
-    """Mean codes over frames, (n_site,) DN, and the temporal variances of these means, (n_site,) DN²."""
+    """Mean codes over frames, (n_site,) DN, and their temporal variances, (n_site,) DN²."""
 
     mean_dn: Floats
     noise_dn2: Floats
 
 
-def mean_image(frames: Any, dark: Any | None = None, relative_photons: Floats | None = None) -> MeanImage:
+def mean_image(frames: Any, dark: Any | None = None, ratio: Floats | None = None) -> MeanImage:
     """
     Return the mean of frames, with the signal of each site as for the mean photons.
 
-    ``frames``, ``dark``: frames of one level. ``relative_photons``: photons of each site over their mean, or None. The signal
+    ``frames``, ``dark``: frames of one level. ``ratio``: photons of each site over their mean, or None. The signal
     above the mean of ``dark`` is divided by them.
     """
     lit = _mean_and_noise(frames)
-    if relative_photons is None:
+    if ratio is None:
         return lit
-    factor, unlit = 1.0 / relative_photons, _mean_and_noise(dark)
+    factor, unlit = 1.0 / ratio, _mean_and_noise(dark)
     return MeanImage(
         factor * lit.mean_dn + (1.0 - factor) * unlit.mean_dn,
         factor**2 * lit.noise_dn2 + (1.0 - factor) ** 2 * unlit.noise_dn2,
@@ -71,9 +71,9 @@ def _mean_and_noise(frames: Any) -> MeanImage:
 
 def class_grids(layout: Layout, groups: SiteClasses) -> list[Ints | None]:
     """
-    Return the sites of each class as an array (n_row, n_column), None for a class that is no grid.
+    Return the sites of each class as an array (n_row, n_column), or None.
 
-    Warns when no class is one.
+    None for a class without complete rows and columns; warns when no class has them.
     """
     rows, columns = (site_rows(layout, axis) for axis in (1, 0))
     grids: list[Ints | None] = [None] * groups.labels.size
@@ -152,13 +152,13 @@ def spatial_parts(image: MeanImage, grid: Ints, *, highpass: bool = False) -> Sp
     return SpatialParts(variance_dn2, low_dn2, high_dn2)
 
 
-def _highpass(picture: Floats) -> Floats:
+def _highpass(picture_dn: Floats) -> Floats:
     """Return the picture without its smoothed picture, and without margins."""
-    smooth = picture
+    smooth = picture_dn
     for axis in (0, 1):
         windows = np.lib.stride_tricks.sliding_window_view(smooth, SMOOTHING.size, axis=axis)
         smooth = windows @ SMOOTHING
-    return np.asarray(picture[MARGIN:-MARGIN, MARGIN:-MARGIN] - smooth)
+    return np.asarray(picture_dn[MARGIN:-MARGIN, MARGIN:-MARGIN] - smooth)
 
 
 def _responses(n: int) -> tuple[float, float]:
@@ -178,13 +178,13 @@ class Nonuniformity:
 
     Attributes
     ----------
-    squares : dict of str to (n_class,) float64
+    values : dict of str to (n_class,) float64
         Squares of the parameters, which may be negative; NaN without rows and columns.
     limits : dict of str to (n_class, 2) float64
         Limits of the squares.
     """
 
-    squares: dict[str, Floats]
+    values: dict[str, Floats]
     limits: dict[str, Floats]
 
 

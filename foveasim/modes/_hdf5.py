@@ -131,6 +131,12 @@ def read_events(path: Path) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8]
     return t_s, arrays["events/site"], (2 * arrays["events/p"].astype(np.int8) - 1).astype(np.int8), layout
 
 
+def is_own_file(path: Path) -> bool:
+    """Return whether :class:`EventFile` wrote a file, by its attributes."""
+    found, _ = read_in_sandbox(_format_of, path, kind="HDF5", max_decompressed_bytes=_max_decompressed_bytes)
+    return bool(found["is_own"])
+
+
 def _append(dataset: Any, values: NDArray[Any]) -> None:
     n = dataset.shape[0]
     dataset.resize((n + values.size,))
@@ -151,7 +157,7 @@ def _read(file_name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     path = Path(file_name)
     with h5py.File(path, "r") as file:
         if file.attrs.get("format") != FORMAT:
-            raise FileError(path, "does not contain events of foveasim; create them with Events.from_addresses")
+            raise FileError(path, "does not contain events of foveasim; read it with Events.read")
         if file.attrs.get("version") != VERSION:
             raise FileError(path, f"has the format version {file.attrs.get('version')!s:.40}, expected {VERSION}")
         found = {f"events/{name}": _dataset(path, file, "events", name) for name in ("t", "site", "p")}
@@ -163,6 +169,13 @@ def _read(file_name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
             raise FileError(path, "would decompress to more than a file of its size can contain")
         arrays = [np.ascontiguousarray(part[()]) for part in found.values()]
     return {"names": list(found)}, arrays
+
+
+def _format_of(file_name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    import h5py
+
+    with h5py.File(file_name, "r") as file:
+        return {"is_own": bool(np.array_equal(file.attrs.get("format"), FORMAT))}, []
 
 
 def _group(path: Path, file: Any, name: str) -> Mapping[str, Any]:

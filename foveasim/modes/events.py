@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,22 +22,32 @@ from foveasim.errors import FileError, FoveasimWarning, ParameterError, type_nam
 from foveasim.layout.model import Layout
 from foveasim.layout.packed import OUTLINES, layout_from_arrays, layout_to_arrays
 from foveasim.modes import _hdf5
+from foveasim.modes._addresses import (
+    MAX_ADDRESS,
+    addresses_from_columns,
+    addresses_on_raster,
+    count_distinct,
+    pixel_grid,
+    sites_at,
+    too_many_addresses,
+)
+from foveasim.modes.event_files import TimeUnit, read_recording
 
 __all__ = ["Events", "write_events"]
 
 FORMAT, VERSION = "foveasim events", 1
 HDF5_EXTENSIONS = (".h5", ".hdf5")
-#: Addresses in files of event tools are unsigned or signed 16-bit integers.
-MAX_ADDRESS, MAX_SIGNED_ADDRESS = 2**16 - 1, 2**15 - 1
+#: Addresses of structured arrays are signed 16-bit integers.
+MAX_SIGNED_ADDRESS = 2**15 - 1
 #: Event record of event tools: address, time in µs, and polarity (true for ON).
 STRUCTURE = np.dtype([("x", "<i2"), ("y", "<i2"), ("t", "<i8"), ("p", "?")])
 #: Above this time float64 does not resolve microseconds.
 MAX_T_S = 2.0**53 / 1e6
 #: Size limit of histograms.
 MAX_COUNTS = 1 << 30
-#: Relative rounding error of distances between neighbours.
-ROUNDING = 1e-9
 POLARITIES = (1, -1)
+#: Time 0 of events from files.
+Origin = Literal["file", "first_event"]
 ARRAYS = ("t_s", "site", "polarity")
 
 
@@ -202,8 +212,6 @@ class Events:
         """
         empty = np.zeros(0)
         site_x, site_y = cls(empty, empty.astype(np.int32), empty.astype(np.int8), layout).addresses(pitch_um)
-        code = site_x.astype(np.int64) * (MAX_ADDRESS + 1) + site_y
-        order = np.argsort(code, kind="stable")
         addresses = [as_numbers(name, values, keep_type=True) for name, values in (("x", x), ("y", y))]
         for name, values in zip("xy", addresses, strict=True):
             if (
@@ -214,14 +222,8 @@ class Events:
                 raise ParameterError(name, f"must be one integer per event, got {values.dtype}{values.shape}")
             if values.size and not 0 <= values.min() <= values.max() <= MAX_ADDRESS:
                 raise ParameterError(name, f"must be from 0 to {MAX_ADDRESS}", (int(values.min()), int(values.max())))
-        target_code = addresses[0].astype(np.int64) * (MAX_ADDRESS + 1) + addresses[1].astype(np.int64)
-        first, last = (np.searchsorted(code[order], target_code, side) for side in ("left", "right"))
-        if np.any(last - first != 1):
-            bad = int(np.flatnonzero(last - first != 1)[0])
-            n = int(last[bad] - first[bad])
-            address = int(addresses[0][bad]), int(addresses[1][bad])
-            raise ParameterError("layout", f"must have one site at each address (x, y), got {n} at {address}")
-        return cls(t_s, order[first].astype(np.int32), polarity, layout)  # type: ignore[arg-type]
+        target = tuple(values.astype(np.int64) for values in addresses)
+        return cls(t_s, sites_at((site_x, site_y), target), polarity, layout)  # type: ignore[arg-type]
 
     def addresses(
         self, pitch_um: Annotated[float | None, POSITIVE] = None
@@ -245,10 +247,10 @@ class Events:
         FoveasimWarning
             When several sites have the same address.
         """
-        addresses = _addresses_from_columns(self.layout) if pitch_um is None else None
+        addresses = addresses_from_columns(self.layout) if pitch_um is None else None
         if addresses is None:
-            addresses = _addresses_on_raster(self.layout, pitch_um)
-        n_distinct = np.unique(addresses[0] * (MAX_ADDRESS + 1) + addresses[1]).size
+            addresses = addresses_on_raster(self.layout, pitch_um)
+        n_distinct = count_distinct(*addresses)
         if n_distinct < self.layout.n_sites:
             warn(
                 f"{self.layout.n_sites:,} sites have only {n_distinct:,} addresses on the raster; use a smaller 'pitch_um', "
@@ -278,7 +280,7 @@ class Events:
         """
         x, y = self.addresses(pitch_um)
         if max(x.max(initial=0), y.max(initial=0)) > MAX_SIGNED_ADDRESS:
-            raise _too_many_addresses(pitch_um, MAX_SIGNED_ADDRESS, "int16")
+            raise too_many_addresses(pitch_um, MAX_SIGNED_ADDRESS, "int16")
         events = np.empty(len(self), STRUCTURE)
         events["x"], events["y"] = x[self.site], y[self.site]
         events["t"], events["p"] = _to_us(self.t_s), self.polarity > 0
@@ -344,6 +346,89 @@ class Events:
         with open_archive(source, "event file", FORMAT, VERSION) as (about, arrays):
             layout = layout_from_arrays(arrays, about.get("provenance", {}))
             return cls(arrays["t_s"], arrays["site"], arrays["polarity"], layout)
+
+    @classmethod
+    def read(
+        cls,
+        path: str | Path,
+        layout: Layout | None = None,
+        *,
+        pitch_um: Annotated[float | None, POSITIVE] = None,
+        time_unit: TimeUnit | None = None,
+        origin: Origin = "file",
+        ignore: Sequence[str] = (),
+    ) -> Events:
+        """
+        Read events of other programs, or those that :meth:`save` wrote.
+
+        Parameters
+        ----------
+        path : path
+            The content selects the format: RAW of Prophesee with EVT 2.0, 2.1 or 3.0; DAT; AEDAT 2 (DAVIS 240 and 346, DVS
+            640) and AEDAT 4 (needs the extra ``events``); HDF5 as of DSEC, v2e and Metavision; ``.npy`` with the fields t, x,
+            y and p; text with lines ``t x y p``; ``.npz`` and HDF5 of this package, with their layout.
+        layout : Layout, optional
+            Layout with one site for each pixel (see :meth:`from_addresses`), whose row 0 is the top row. By default a grid of
+            the sensor size that the file states.
+        pitch_um : float, optional, µm
+            Pixel pitch, which files do not contain: of the grid, or of the addresses of a ``layout``.
+        time_unit : {"s", "ms", "us", "ns"}, optional
+            Unit of the times in text and ``.npy`` files. By default µs in arrays of integers, and seconds in text with
+            decimals. All other formats have µs.
+        origin : {"file", "first_event"}
+            Time 0: that of the clock of the file, or the first event. Clocks may begin when the camera is switched on (RAW), or
+            in 1970 (AEDAT 4); DSEC's ``t_offset`` is added.
+        ignore : sequence of str
+            Names of headers or arrays that are not known and do not change the events.
+
+        Returns
+        -------
+        Events
+            In the order of their times. ON events are 1, OFF events -1.
+
+        Raises
+        ------
+        FileError
+            When the file is damaged, of another format, or contains what is not understood.
+        ParameterError
+            When neither a layout nor a pitch and the size of the sensor are known, or an event has no site.
+
+        Notes
+        -----
+        External triggers, words of vendors, frames and samples of inertial sensors are no events of sites, and are not read.
+        Times of EVT 2.0, EVT 3.0 and DAT begin anew after 2^34, 2^24 and 2^32 µs; they continue here. Events before the first
+        time of RAW files have no time, and are skipped, as by Metavision.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import foveasim as fs
+        >>> with tempfile.TemporaryDirectory() as directory:
+        ...     path = Path(directory, "events.txt")
+        ...     _ = path.write_text("0.001 1 0 0")
+        ...     events = fs.modes.Events.read(path, fs.layout.grid(n_x=2, n_y=1, pitch_um=5.0))
+        >>> events.t_s.tolist(), events.site.tolist(), events.polarity.tolist()
+        ([0.001], [1], [-1])
+        """
+        source = Path(path)
+        if _is_own_file(source):
+            if layout is not None or pitch_um is not None:
+                name, value = ("layout", layout) if layout is not None else ("pitch_um", pitch_um)
+                raise ParameterError(name, "must not be given for files with their layout", value, hint="omit it")
+            return _with_origin(cls.load(source), origin)
+        shape = None if layout is None else _raster_shape(layout, pitch_um)
+        found = read_recording(source, time_unit=time_unit, ignore=tuple(ignore), shape=shape)
+        t_s = found.t_us / 1e6
+        if layout is None:
+            if found.shape is None or pitch_um is None:
+                size = "the file does not state the size of the sensor"
+                if found.shape is not None:
+                    size = f"the sensor has {found.shape[1]} x {found.shape[0]} pixels; or pass pitch_um="
+                raise ParameterError("layout", f"must be given for {source.name}: {size}")
+            layout, pitch_um = pixel_grid(found.shape, pitch_um), None
+        polarity = np.where(found.is_on, np.int8(1), np.int8(-1))
+        return _with_origin(cls.from_addresses(t_s, found.x, found.y, polarity, layout, pitch_um=pitch_um), origin)
 
 
 def write_events(
@@ -418,6 +503,31 @@ def write_events(
 # -- parts ------------------------------------------------------------------------------------------------------------
 
 
+def _is_own_file(path: Path) -> bool:
+    """Return whether a file contains events with their layout."""
+    if path.suffix.lower() == ".npz":
+        return True
+    if path.suffix.lower() not in HDF5_EXTENSIONS or not path.is_file():
+        return False
+    import_optional(path, "h5py")
+    with as_file_error(path, "event file"):
+        return _hdf5.is_own_file(path)
+
+
+def _with_origin(events: Events, origin: Origin) -> Events:
+    """Return events with time 0 at the first one, if this is the origin."""
+    if origin == "file" or not len(events):
+        return events
+    t_us = _to_us(events.t_s)
+    return Events((t_us - t_us[0]) / 1e6, events.site, events.polarity, events.layout)
+
+
+def _raster_shape(layout: Layout, pitch_um: float | None) -> tuple[int, int]:
+    empty = np.zeros(0)
+    x, y = Events(empty, empty.astype(np.int32), empty.astype(np.int8), layout).addresses(pitch_um)
+    return int(y.max(initial=0)) + 1, int(x.max(initial=0)) + 1
+
+
 def _check_consecutive(name: str, batches: Iterable[Events]) -> Iterator[Events]:
     """Yield batches after checking that they have one layout and are consecutive."""
     if isinstance(batches, Events) or not isinstance(batches, Iterable):
@@ -442,58 +552,6 @@ def _check_consecutive(name: str, batches: Iterable[Events]) -> Iterator[Events]
                 )
             last_s = float(batch.t_s[-1])
         yield batch
-
-
-def _addresses_from_columns(layout: Layout) -> tuple[Ints, Ints] | None:
-    """
-    Return column and row of each site from the columns of the layout.
-
-    Returns None if the columns are missing, not aligned with the axes, or not unique.
-    """
-    centred_um = layout.centroid_um - layout.centroid_um.mean(axis=0) if layout.n_sites else layout.centroid_um
-    addresses = []
-    for axis, name in enumerate(("column", "row")):
-        numbers = layout.columns.get(name)
-        if numbers is None or numbers.dtype.kind not in "iu":
-            return None
-        integers = numbers.astype(np.int64)
-        integers -= integers.min(initial=0)
-        along, across = (
-            float((integers - integers.mean()) @ centred_um[:, a]) if integers.size else 0.0 for a in (axis, 1 - axis)
-        )
-        if abs(along) < abs(across) or integers.max(initial=0) > MAX_ADDRESS:
-            return None
-        # Columns count to the right, rows downwards.
-        is_reversed = along < 0.0 if axis == 0 else along >= 0.0
-        addresses.append(integers.max(initial=0) - integers if is_reversed else integers)
-    is_unique = np.unique(addresses[0] * (MAX_ADDRESS + 1) + addresses[1]).size == layout.n_sites
-    return (addresses[0], addresses[1]) if is_unique else None
-
-
-def _addresses_on_raster(layout: Layout, pitch_um: float | None) -> tuple[Ints, Ints]:
-    """Return column and row of each centroid on a raster, counted from the top left."""
-    from scipy.spatial import cKDTree
-
-    centroid_um = layout.centroid_um
-    if layout.n_sites == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    low_um, high_um = centroid_um.min(axis=0), centroid_um.max(axis=0)
-    if pitch_um is None:
-        # Centroids with a larger distance along either axis are in different columns or rows.
-        distance_um = np.asarray(cKDTree(centroid_um).query(centroid_um, k=2, p=np.inf)[0])[:, 1]
-        nearest_um = float(distance_um[distance_um > 0.0].min(initial=np.inf))
-        finest_um = float((high_um - low_um).max()) / MAX_ADDRESS
-        pitch_um = max((1.0 - ROUNDING) * nearest_um, finest_um) if np.isfinite(nearest_um) else 1.0
-    column = np.floor((centroid_um[:, 0] - low_um[0]) / pitch_um + 0.5)
-    row = np.floor((high_um[1] - centroid_um[:, 1]) / pitch_um + 0.5)
-    if max(column.max(), row.max()) > MAX_ADDRESS:
-        raise _too_many_addresses(pitch_um, MAX_ADDRESS, "uint16")
-    return column.astype(np.int64), row.astype(np.int64)
-
-
-def _too_many_addresses(pitch_um: float | None, limit: int, kind: str) -> ParameterError:
-    rule = f"must give at most {limit + 1} columns and rows, the range of {kind} addresses"
-    return ParameterError("pitch_um", rule, pitch_um, "µm")
 
 
 def _to_us(t_s: Floats) -> Ints:

@@ -579,6 +579,7 @@ CALLS = {
     "metrics.ssim": lambda o: metrics.ssim(PICTURE[..., 0] / 255.0, PICTURE[..., 1] / 255.0, data_range=1.0),
     "metrics.wave_vectors_per_mm": lambda o: metrics.wave_vectors_per_mm([1.0, 2.0]),
     "modes.write_events": lambda o: modes.write_events([o.events], o.path(".h5")),
+    "modes.Events.read": lambda o: modes.Events.read(o.written(".txt", o.events.save), o.events.layout),
     "modes.Events.save": lambda o: modes.Events.load(o.written(".npz", o.events.save)),
     "modes.Events.save h5": lambda o: modes.Events.load(o.written(".h5", o.events.save)),
     "optics.circular_otf": lambda o: optics.circular_otf([0.0, 0.5]),

@@ -624,7 +624,7 @@ def write_corrupt_hdf5(path, defect):
     ("defect", "message"),
     [
         ("truncated", "is corrupt"),
-        ("other format", "does not contain events of foveasim; create them with Events.from_addresses"),
+        ("other format", "does not contain events of foveasim; read it with Events.read"),
         ("version", "has the format version 7, expected 2"),
         ("link", "must contain the numbers 'events/t', not a link"),
         ("external", "must contain the numbers 'events/t', not a link or external data"),
