@@ -155,6 +155,15 @@ def test_unitless_drawing_requires_unit(tmp_path):
     assert fs.read_layout(path, unit="mm").area_um2.tolist() == [2e6]
 
 
+def test_missing_unit_is_no_metre(tmp_path):
+    document, model = drawing()
+    model.add_lwpolyline([(0, 0), (2, 0), (0, 2)], close=True)
+    path = saved(document, tmp_path)
+    path.write_text(path.read_text().replace("$INSUNITS", "$INSBASE2"))
+    with pytest.raises(FileError, match="is unitless|ignores"):
+        fs.read_layout(path)
+
+
 @pytest.mark.parametrize(
     ("add", "named"),
     [
@@ -209,6 +218,17 @@ def test_outlines_match_klayout(tmp_path):
 
     assert region.count() == layout.n_sites == 12
     assert region.area() * shapes.dbu**2 == pytest.approx(layout.area_um2.sum(), rel=1e-3)
+
+
+def test_ignored_content_is_named(tmp_path):
+    document, model = drawing()
+    document.blocks.new("P").add_lwpolyline([(0, 0), (2, 0), (0, 2)], close=True)
+    model.add_blockref("P", (0, 0))
+    model.add_circle((9, 0), 2.0)
+    path = saved(document, tmp_path)
+    path.write_text(path.read_text().replace("ENDBLK", "ENDBLX"))
+    with pytest.raises(FileError, match="has content that ezdxf ignores"):
+        fs.read_layout(path)
 
 
 def test_changed_text_reads_or_raises(tmp_path):

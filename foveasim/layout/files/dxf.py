@@ -8,6 +8,7 @@ at most ``max_sagitta_um``. The format is read-only.
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ from foveasim._core.calls import Limits
 from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._core.validation import MAX_SITES, Floats
-from foveasim._io.formats import FileFormat, as_file_error
+from foveasim._io.formats import FileFormat, as_file_error, one_line
 from foveasim.errors import FileError, LayoutWarning, ParameterError, warn
 from foveasim.layout.files._common import FORMATS
 from foveasim.layout.files._outlines import (
@@ -60,6 +61,8 @@ CLOSED = 1e-9
 SPLINE_FRAME, MAX_CHORDS = 16, 100_000
 #: Number of kinds of entities in a message.
 MAX_LISTED = 5
+#: Characters of a message of ezdxf.
+MAX_MESSAGE = 160
 
 
 def read(
@@ -79,14 +82,15 @@ def read(
     """
     ezdxf = import_optional(path, "ezdxf")
     with as_file_error(path, "DXF drawing", passes=(ParameterError,)):
-        drawing = _drawing(path, ezdxf)
-        number = int(drawing.header.get("$INSUNITS", 0))
+        drawing = _drawing(path, ezdxf, invalid)
+        # ezdxf assumes metres where a file has no such variable, as those of R12.
+        number = int(drawing.header.get("$INSUNITS", 0)) if b"$INSUNITS" in path.read_bytes() else 0
         if number and number not in UNITS_UM:
             raise FileError(path, f"has the unit $INSUNITS = {number}, which is not a length of a layout")
         if number:
             unit_um = agreed_unit(path, unit, *UNITS_UM[number])
         else:
-            unit_um = required_unit(path, unit, "is unitless ($INSUNITS = 0)")
+            unit_um = required_unit(path, unit, "is unitless (its $INSUNITS is 0 or missing)")
         reader = _Reader(_names(layer), max_sagitta_um / unit_um)
         found = list(reader.outlines(drawing.modelspace(), np.eye(4), None, 0))
         _check_layers(path, reader, found, layer)
@@ -109,11 +113,37 @@ def read(
         )
 
 
-def _drawing(path: Path, ezdxf: Any) -> Any:
+class _Messages(logging.Handler):
+    """Warnings of ezdxf about content that it ignores."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep the text of a warning."""
+        self.texts.append(one_line(record.getMessage(), MAX_MESSAGE))
+
+
+def _drawing(path: Path, ezdxf: Any, invalid: str) -> Any:
+    """Read a drawing; what ezdxf ignores is an error, or a warning if invalid outlines are skipped."""
+    messages, logger = _Messages(), logging.getLogger("ezdxf")
+    propagates, logger.propagate = logger.propagate, False
+    logger.addHandler(messages)
     try:
-        return ezdxf.readfile(str(path))
+        drawing = ezdxf.readfile(str(path))
     except ezdxf.DXFError as error:
-        raise FileError(path, f"is corrupt or not a valid DXF drawing ({' '.join(str(error).split())[:160]})") from None
+        reason = one_line(str(error), MAX_MESSAGE)
+        raise FileError(path, f"is corrupt or not a valid DXF drawing ({reason})") from None
+    finally:
+        logger.removeHandler(messages)
+        logger.propagate = propagates
+    if messages.texts:
+        what = f"has content that ezdxf ignores: {messages.texts[0]}"
+        if invalid == "error":
+            raise FileError(path, f"{what}; repair the file, or pass invalid='skip'")
+        warn(f"{path.name}: {what}", LayoutWarning)
+    return drawing
 
 
 def _names(layer: Any) -> frozenset[str] | None:
