@@ -193,7 +193,8 @@ def validate_options(
     for name, value in given.items():
         if name not in known:
             titles = sorted({found.title for found in formats.values() if name in getattr(found, of)})
-            rule = f"is an option of {' and '.join(titles)} files only" if titles else "is not an option of any format"
+            listed = " and ".join((", ".join(titles[:-1]), titles[-1])) if len(titles) > 1 else "".join(titles)
+            rule = f"is an option of {listed} files only" if titles else "is not an option of any format"
             every = sorted({option for found in formats.values() for option in getattr(found, of)})
             hint = "omit it" if titles else possible_names(name, every)
             raise ParameterError(name, rule, value, hint=hint)

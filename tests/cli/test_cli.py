@@ -367,7 +367,7 @@ def test_convert_writes_layer_map(foveasim, tmp_path):
         (("--layer", "2", "--layer", "well=1"), "'layer' must have a name in a layer map, got '2'; photosite=2"),
         (("--layer", "one"), "'layer' must be a layer, such as (77, 3) or '77/3', got 'one'"),
         (("--layers", "none.yaml"), "none.yaml: no such file"),
-        (("--source-layer", "3"), "'layer' is an option of GDSII and OASIS files only"),
+        (("--source-layer", "3"), "'layer' is an option of DXF, GDSII and OASIS files only"),
     ],
 )
 def test_convert_rejects_invalid_layers(foveasim, tmp_path, arguments, words):

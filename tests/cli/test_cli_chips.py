@@ -119,7 +119,7 @@ def test_chip_is_compared_with_other_formats(foveasim, folder):
 
     assert (folder / "comparison.html").is_file()
     assert (rejected.returncode, rejected.stderr.count("\n")) == (2, 1)
-    assert "'layer' is an option of GDSII and OASIS files only" in rejected.stderr
+    assert "'layer' is an option of DXF, GDSII and OASIS files only" in rejected.stderr
 
 
 @pytest.mark.slow

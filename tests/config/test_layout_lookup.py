@@ -53,9 +53,9 @@ def test_read_layout_reads_files_of_any_format(tmp_path, two_sites):
 
     for name in ("two.geojson", "two.yaml"):
         assert np.array_equal(fs.read_layout(tmp_path / name).xy_um, two_sites.xy_um)
-    with pytest.raises(ParameterError, match="'layer' is an option of GDSII and OASIS files only, got 3; omit it"):
+    with pytest.raises(ParameterError, match="'layer' is an option of DXF, GDSII and OASIS files only, got 3; omit it"):
         fs.read_layout(tmp_path / "two.yaml", layer=3)
-    with pytest.raises(ParameterError, match="'cell' is an option of GDSII and OASIS files"):
+    with pytest.raises(ParameterError, match="'cell' is an option of GDSII, NeXus and OASIS files"):
         fs.read_layout("giotto_2", cell="TOP")
 
 

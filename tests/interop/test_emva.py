@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from other_programs import other_program
 
 import foveasim as fs
 from foveasim.metrics import emva1288
 
-reference_data = pytest.importorskip("emva1288.process.data")
-reference_results = pytest.importorskip("emva1288.process.results")
+reference_data = other_program("emva1288.process.data")
+reference_results = other_program("emva1288.process.results")
 
 SHAPE, N_FRAMES = (60, 80), 8
 PHOTONS = np.array([1000.0, 2000.0, 5000.0, 8000.0, 10_000.0, 12_000.0])

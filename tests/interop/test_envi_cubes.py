@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from other_programs import other_program
 
 import foveasim as fs
 
-envi = pytest.importorskip("spectral.io.envi")
+envi = other_program("spectral.io.envi")
 
 #: Values [band, row, column], top row first.
 VALUES = np.arange(3 * 4 * 5, dtype=np.float64).reshape(3, 4, 5) + 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from other_programs import other_program
 
 from foveasim.modes.event_files import read_recording
 
@@ -29,7 +30,7 @@ def assert_equal(found, events):
 
 @pytest.mark.parametrize(("encoding", "name"), [("dat", "e.dat"), ("evt2", "e.raw"), ("evt3", "e.raw")])
 def test_files_of_expelliarmus_are_equal(tmp_path, encoding, name):
-    expelliarmus = pytest.importorskip("expelliarmus")
+    expelliarmus = other_program("expelliarmus")
     path, events = tmp_path / name, known_events()
     wizard = expelliarmus.Wizard(encoding=encoding)
     wizard.save(fpath=str(path), arr=events)
@@ -40,7 +41,7 @@ def test_files_of_expelliarmus_are_equal(tmp_path, encoding, name):
 
 @pytest.mark.parametrize(("encoding", "name"), [("evt2", "e.raw"), ("evt3", "e.raw")])
 def test_evlib_reads_the_same_events(tmp_path, encoding, name):
-    evlib = pytest.importorskip("evlib")
+    evlib = other_program("evlib")
     path = tmp_path / name
     events = known_events()
     write_evt(path, encoding, events)
@@ -70,12 +71,12 @@ def write_evt(path, encoding, events):
 
 @pytest.mark.parametrize(("encoding", "name"), [("evt3", "e.raw"), ("dat", "e.dat"), ("aedat4", "e.aedat4")])
 def test_aestream_reads_the_same_events(tmp_path, encoding, name):
-    aestream = pytest.importorskip("aestream")
+    aestream = other_program("aestream")
     path, events = tmp_path / name, known_events(2000)
     if encoding == "aedat4":
         write_aedat4(path, events)
     elif encoding == "dat":
-        pytest.importorskip("expelliarmus").Wizard(encoding=encoding).save(fpath=str(path), arr=events)
+        other_program("expelliarmus").Wizard(encoding=encoding).save(fpath=str(path), arr=events)
     else:
         write_evt(path, encoding, events)
     other = aestream.FileInput(str(path), (640, 480)).load()
@@ -90,7 +91,7 @@ def test_aestream_reads_the_same_events(tmp_path, encoding, name):
 
 
 def write_aedat4(path, events):
-    dv = pytest.importorskip("dv_processing")
+    dv = other_program("dv_processing")
     store = dv.EventStore()
     for t, x, y, p in events.tolist():
         store.push_back(t, x, y, bool(p))
@@ -100,7 +101,7 @@ def write_aedat4(path, events):
 
 
 def test_aedat4_of_dv_processing_is_equal(tmp_path):
-    pytest.importorskip("aedat")
+    other_program("aedat")
     path, events = tmp_path / "e.aedat4", known_events(5000)
     write_aedat4(path, events)
     found = read_recording(path)
@@ -110,7 +111,7 @@ def test_aedat4_of_dv_processing_is_equal(tmp_path):
 
 
 def test_damaged_aedat4_is_valid_or_named(tmp_path):
-    pytest.importorskip("aedat")
+    other_program("aedat")
     from foveasim.errors import FileError
 
     path = tmp_path / "e.aedat4"
@@ -125,12 +126,3 @@ def test_damaged_aedat4_is_valid_or_named(tmp_path):
             read_recording(path)
         except FileError as error:
             assert "\n" not in str(error)  # noqa: PT017 -- one line
-
-
-def test_tonic_reads_structured_arrays(tmp_path):
-    tonic_io = pytest.importorskip("tonic.io")
-    events = known_events(100)
-    path = tmp_path / "e.npy"
-    np.save(path, tonic_io.make_structured_array(events["x"], events["y"], events["t"], events["p"]))
-
-    assert_equal(read_recording(path), events)

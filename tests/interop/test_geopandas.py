@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from other_programs import other_program
 
 import foveasim as fs
 from foveasim.errors import FileError
 
-geopandas = pytest.importorskip("geopandas")
+geopandas = other_program("geopandas")
 
 LAYOUT = fs.layout.hexagonal(n_columns=4, n_rows=3, pitch_um=3.0)
 

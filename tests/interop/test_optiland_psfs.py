@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from other_programs import other_program
 
 import foveasim as fs
 
-pytest.importorskip("optiland")
+other_program("optiland")
 pytestmark = pytest.mark.filterwarnings("ignore")  # of the other program and its compiler
 WAVE_UM = 0.55
 

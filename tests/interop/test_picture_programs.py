@@ -6,11 +6,12 @@ import os
 
 import numpy as np
 import pytest
+from other_programs import other_program
 
 from foveasim._io.images import as_encoded
 
-cv2 = pytest.importorskip("cv2")
-io = pytest.importorskip("skimage.io")
+cv2 = other_program("cv2")
+io = other_program("skimage.io")
 os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
 
 LIGHT = np.random.default_rng(4).random((12, 20, 3)).astype(np.float32)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from other_programs import other_program
 
 import foveasim as fs
 
-detectors = pytest.importorskip("pyFAI.detectors")
+detectors = other_program("pyFAI.detectors")
 
 
 def corners_um(detector):

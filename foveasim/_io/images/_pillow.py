@@ -156,7 +156,11 @@ def _orientation(image: Image.Image) -> Any:
 
 
 def _resolution(image: Image.Image) -> tuple[float, float]:
-    """Return the resolution along x and y of JFIF or BMP; 0 if it is unknown. That of EXIF is of prints, not of pixels."""
+    """
+    Return the resolution along x and y of JFIF or BMP; 0 if it is unknown.
+
+    That of EXIF is of prints, not of pixels.
+    """
     x, y = image.info.get("dpi" if image.format == "BMP" else "jfif_density", (0.0, 0.0))
     return float(x), float(y)
 

@@ -32,7 +32,7 @@ SAME = 1e-9
 
 
 def n_vertices_of_disc(tolerance: float) -> int:
-    """Return the number of vertices of a disc for a maximum distance from the circle, in radii."""
+    """Return the number of vertices of a disc for a largest distance from the circle, radii."""
     # That of the vertices, larger than that of the edges, is the square of the angle between two of them over 12.
     return STEPS * max(1, math.ceil(2.0 * math.pi / math.sqrt(12.0 * tolerance) / STEPS))
 

@@ -742,7 +742,7 @@ def test_options_of_other_formats_are_rejected(zoo, tmp_path, options, extension
 
 def test_gdsii_read_option_rejected_for_npz(zoo, tmp_path):
     write_layout(zoo, tmp_path / "a.npz")
-    with pytest.raises(ParameterError, match="'layer' is an option of GDSII and OASIS files"):
+    with pytest.raises(ParameterError, match="'layer' is an option of DXF, GDSII and OASIS files"):
         read_layout(tmp_path / "a.npz", layer=1)
 
 
