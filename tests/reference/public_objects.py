@@ -53,6 +53,7 @@ BY_CLASS = {"classes": np.arange(50), "n_sites": np.arange(50)}
 PER_CLASS = dict.fromkeys(
     (
         "gain_dn_per_e", "responsivity_dn_per_ph", "qe", "dark_noise_dn", "dark_noise_e", "is_quantisation_limited", "saturation_ph", "threshold_ph", "linearity_error_min_fraction", "linearity_error_max_fraction", "dsnu_e", "prnu_fraction",
+        "dsnu_row_e", "dsnu_column_e", "dsnu_pixel_e", "prnu_row_fraction", "prnu_column_fraction", "prnu_pixel_fraction",
         "dark_current_e_per_s", "dark_current_from_variance_e_per_s", "underflow_fraction",
     ),
     np.ones(50),

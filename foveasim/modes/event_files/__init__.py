@@ -11,9 +11,13 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.modes.event_files._arrays import HDF5_SIGNATURE, is_text, read_hdf5, read_npy, read_text
 from foveasim.modes.event_files._inivation import read_aedat2, read_aedat4
 from foveasim.modes.event_files._prophesee import read_dat, read_raw
-from foveasim.modes.event_files._recording import TIME_UNITS, Recording, TimeUnit
+from foveasim.modes.event_files._recording import TIME_UNITS, Recording, TimeUnit, empty_recording
 
 __all__ = ["EVENT_FORMATS", "Recording", "TimeUnit", "read_recording"]
+
+
+#: Extensions of text: a file without lines has no events.
+TEXT_SUFFIXES = (".txt", ".csv")
 
 
 def _begins_with_header(path: Path, head: bytes, *, is_dat: bool) -> bool:
@@ -56,7 +60,7 @@ EVENT_FORMATS: Mapping[str, FileFormat] = {
     ),
     "text": FileFormat(
         title="text (t x y p)",
-        suffixes=(".txt", ".csv"),
+        suffixes=TEXT_SUFFIXES,
         matches=lambda _, head: is_text(head),
         read=read_text,
         read_options=("time_unit",),
@@ -73,6 +77,8 @@ def read_recording(path: Path, **options: Any) -> Recording:
 
     Raises FileError when the file is damaged, of another format, or contains what is not understood.
     """
+    if path.suffix.lower() in TEXT_SUFFIXES and path.is_file() and not path.stat().st_size:
+        return empty_recording()  # text without lines
     _, form = detect_format(path, EVENT_FORMATS, "file of events")
     assert form.read is not None
     given = {name: value for name, value in options.items() if value is not None and value != ()}

@@ -72,6 +72,11 @@ class Recording:
         return replace(self, **arrays)
 
 
+def empty_recording() -> Recording:
+    """Return a recording without events."""
+    return Recording(np.zeros(0, np.int64), np.zeros(0, np.uint16), np.zeros(0, np.uint16), np.zeros(0, bool))
+
+
 def shape_of(width: int, height: int) -> tuple[int, int]:
     """Return the shape of a sensor of the stated size, or raise a FormatError."""
     if not (0 < width <= MAX_ADDRESS + 1 and 0 < height <= MAX_ADDRESS + 1):
