@@ -761,6 +761,7 @@ COMMANDS = {
     "compile": lambda o: [],
     "layouts": lambda o: [],
     "describe": lambda o: [BUNDLED, "--fps", "30"],
+    "events": lambda o: [o.written(".npz", o.events.save), "--out", o.path(".npy")],
     "convert": lambda o: [o.written(".npz", o.layout.write), o.path(".geojson")],
     "convert gds": lambda o: [o.written(".npz", o.layout.write), o.path(".gds")],
     "view": lambda o: [BUNDLED, "--out", o.path(".html")],
