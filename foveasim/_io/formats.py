@@ -180,6 +180,10 @@ def select_writer(path: Path, formats: Mapping[str, FileFormat]) -> FileFormat:
         raise FileError(path, f"must end in one of {', '.join(sorted(by_suffix))}{'; ' * bool(hint)}{hint}") from None
 
 
+def _listed(titles: list[str]) -> str:
+    return " and ".join([*([", ".join(titles[:-1])] if titles[1:] else []), titles[-1]])
+
+
 def validate_options(
     options: Mapping[str, Any], known: tuple[str, ...], formats: Mapping[str, FileFormat], of: str
 ) -> dict[str, Any]:
@@ -193,8 +197,7 @@ def validate_options(
     for name, value in given.items():
         if name not in known:
             titles = sorted({found.title for found in formats.values() if name in getattr(found, of)})
-            listed = " and ".join((", ".join(titles[:-1]), titles[-1])) if len(titles) > 1 else "".join(titles)
-            rule = f"is an option of {listed} files only" if titles else "is not an option of any format"
+            rule = f"is an option of {_listed(titles)} files only" if titles else "is not an option of any format"
             every = sorted({option for found in formats.values() for option in getattr(found, of)})
             hint = "omit it" if titles else possible_names(name, every)
             raise ParameterError(name, rule, value, hint=hint)

@@ -126,11 +126,7 @@ class _Messages(logging.Handler):
 
 
 def _drawing(path: Path, ezdxf: Any, invalid: str) -> Any:
-    """
-    Read a drawing.
-
-    What ezdxf ignores is an error, or a warning if invalid outlines are skipped.
-    """
+    """Read a drawing; what ezdxf ignores is an error, or a warning with invalid='skip'."""
     messages, logger = _Messages(), logging.getLogger("ezdxf")
     propagates, logger.propagate = logger.propagate, False
     logger.addHandler(messages)

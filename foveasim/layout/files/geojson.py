@@ -115,11 +115,11 @@ def read(path: Path, *, unit: LengthUnit | None = None, invalid: Invalid = "erro
     """
     with as_file_error(path, "GeoJSON layout"):
         document = _Document(path, parts)
-        unit_um = _unit_um(path, document.members, unit)
         if document.problems and invalid == "error":
             number, problem = next(iter(sorted(document.problems.items())))
             n_more = len(document.problems) - 1
             raise FileError(path, f"feature {number} {problem}" + f" (and {n_more} more)" * (n_more > 0))
+        unit_um = _unit_um(path, document.members, unit)
         provenance, types = check_table_header(path, document.members.get("foveasim"), "GeoJSON")
         columns, dropped = document.columns(types)
         if dropped:
