@@ -303,7 +303,9 @@ print(jit.compile_kernels(n_workers={n_workers}))
     assert run(program, tmp_path)[0] == "7"
     stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb[ic]")}
 
-    assert len(list(tmp_path.rglob("*.nbc"))) == 6  # four kernels of files without inner functions, and one for two types
+    assert (
+        len(list(tmp_path.rglob("*.nbc"))) == 6
+    )  # four kernels of files without inner functions, and one for two types
     assert load_kernels(tmp_path) == ("(10, 1024)", "")
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb[ic]")} == stored
 
