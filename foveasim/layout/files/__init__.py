@@ -104,8 +104,8 @@ def read_layout(
     invalid : {"error", "skip", "repair"}, optional
         Not npz: outlines that are not simple polygons, because they cross themselves or have no area, are an error by
         default, which lists them with their positions. ``"skip"`` reads the others, and omits rows without outline.
-        ``"repair"`` also divides an outline where it crosses itself, and reads the largest part. In GDSII and OASIS, the parts
-        of an outline that only touches itself are sites with the same ``site_id``.
+        ``"repair"`` also divides an outline where it crosses itself, and reads the largest part. The parts of an outline that
+        only touches itself are sites with the same ``site_id``.
     unit : {"nm", "um", "mm", "cm", "m", "mil", "in"}, optional
         GeoJSON, GeoParquet, DXF and NeXus: unit of the coordinates where the file does not state a unit of length. Files of
         other programs are in degrees (GeoJSON always, GeoParquet by default), in an unknown reference system, or unitless

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from foveasim._core.rings import SITE_ID, ring_area_um2, site_ids
 from foveasim._core.validation import Floats, Ints
 from foveasim.errors import FileError, GeometryError, LayoutWarning, warn
 from foveasim.layout.files._common import layout_from_untrusted
@@ -26,7 +27,7 @@ Parts: TypeAlias = Literal["error", "split", "largest"]
 #: Integers up to this one are exact in float64.
 MAX_EXACT = 2**53
 #: Number of outlines that a message lists.
-MAX_LISTED = 20
+MAX_LISTED = 50
 #: Differences of z, relative to the largest coordinate, up to which outlines lie in a plane: rounding of float32.
 FLAT = 1e-6
 
@@ -103,7 +104,7 @@ def layout_of_geometries(
     if parts == "split" and is_multiple.any():
         columns |= {"parent": parent, "part": part}
     try:
-        return layout_from_untrusted(polygons, columns, provenance)
+        return with_one_identity(layout_from_untrusted(polygons, columns, provenance), kept)
     except GeometryError as error:
         raise with_fix(path, error) if invalid == "error" else error from None
 
@@ -164,47 +165,68 @@ def _problem(geometry: Any) -> str:
 
 def valid_polygons(path: Path, polygons: NDArray[Any], invalid: str) -> tuple[NDArray[Any], Ints]:
     """
-    Return the valid polygons and their indices, repaired ones included.
+    Return the valid polygons, repaired ones included, and their sites, ascending.
 
     Raises FileError when a polygon is invalid, and ``invalid`` is ``"error"``, or no valid polygon remains. Raises
     GeometryError when the layout is invalid for other reasons.
     """
     check_sizes(np.maximum(shapely.get_num_interior_rings(polygons), 0) + 1, shapely.get_num_coordinates(polygons))
-    polygons = polygons.copy()
+    n_sites, site = polygons.size, np.arange(polygons.size)
     where: dict[int, str] = {}
-    kept = np.arange(polygons.size)
     while True:
         try:
-            Layout.from_polygons(polygons[kept])
+            Layout.from_polygons(polygons)
             break
         except GeometryError as error:
-            bad = kept[list(error.site_ids)]
+            bad = np.array(error.site_ids, np.int64)
             if bad.size == 0:
                 raise
-        is_new = [int(site) not in where for site in bad]
-        where |= {int(site): _place(polygons[site]) for site in bad[is_new]}
-        if invalid == "repair":
-            for site in bad[is_new]:
-                parts = shapely.get_parts(shapely.make_valid(polygons[site]))
-                polygons[site] = parts[np.argmax(shapely.area(parts))] if parts.size else None
-            # Outlines without area vanish, and repaired ones are checked again.
-            bad = bad[[not new or not _is_area(polygons[site]) for new, site in zip(is_new, bad, strict=True)]]
-        kept = np.setdiff1d(kept, bad)
-        if kept.size == 0:
+        # Repaired ones are checked again, and skipped if they are still invalid.
+        new = [i for i in bad.tolist() if int(site[i]) not in where]
+        where |= {int(site[i]): _place(polygons[i]) for i in new}
+        parts = [(site[i], part) for i in new if invalid == "repair" for part in _repaired(polygons[i])]
+        polygons, site = np.delete(polygons, bad), np.delete(site, bad)
+        if parts:
+            site = np.append(site, [s for s, _ in parts])
+            order = np.argsort(site, kind="stable")
+            polygons, site = np.append(polygons, [part for _, part in parts])[order], site[order]
+        if site.size == 0:
             break
     if not where:
-        return polygons, kept
-    shown = ", ".join(f"site {site} at {where[site]} µm" for site in sorted(where)[:MAX_LISTED])
+        return polygons, site
+    shown = ", ".join(f"site {s} at {where[s]} µm" for s in sorted(where)[:MAX_LISTED])
     shown += f" and {len(where) - MAX_LISTED} more" * (len(where) > MAX_LISTED)
-    what = f"of {polygons.size} outlines cross themselves or have no area"
-    if invalid == "error" or kept.size == 0:
-        fix = "correct them" if kept.size == 0 else "correct them, or pass invalid='skip' or invalid='repair'"
+    what = f"of {n_sites} outlines cross themselves or have no area"
+    if invalid == "error" or site.size == 0:
+        fix = "correct them" if site.size == 0 else "correct them, or pass invalid='skip' or invalid='repair'"
         raise FileError(path, f"{len(where)} {what}, {shown}; {fix}")
-    n_skipped = polygons.size - kept.size
+    n_skipped = n_sites - np.unique(site).size
     n_repaired = len(where) - n_skipped
     done = f"{n_skipped} are skipped" + f", {n_repaired} repaired" * (invalid == "repair")
     warn(f"{path.name}: {len(where)} {what}, {shown}: {done}", LayoutWarning)
-    return polygons[kept], kept
+    return polygons, site
+
+
+def _repaired(polygon: Any) -> list[Any]:
+    """Return all parts of an outline that touches itself, and the largest of one that crosses."""
+    parts = shapely.get_parts(shapely.make_valid(polygon))
+    parts = parts[shapely.area(parts) > 0.0]
+    if parts.size < 2:
+        return list(parts)
+    xy_um = shapely.get_coordinates(shapely.get_exterior_ring(polygon))
+    outline_um2 = abs(float(ring_area_um2(xy_um, np.array([0, len(xy_um)]))[0]))
+    # The winding order changes where an outline crosses itself, so that areas of its parts are subtracted from each other.
+    is_touching = abs(outline_um2 - shapely.area(parts).sum()) <= 1e-9 * outline_um2
+    return list(parts) if is_touching else [parts[np.argmax(shapely.area(parts))]]
+
+
+def with_one_identity(layout: Layout, site: Ints) -> Layout:
+    """Return the layout with the identity of the first part for all parts of a site."""
+    is_part = np.append(False, site[1:] == site[:-1])
+    if not is_part.any():
+        return layout
+    ids = site_ids(layout)
+    return layout.with_columns(**{SITE_ID: ids[np.searchsorted(site, site)]})
 
 
 def _place(polygon: Any) -> str:
@@ -212,7 +234,3 @@ def _place(polygon: Any) -> str:
     found = re.search(r"\[(\S+) (\S+)\]", str(shapely.is_valid_reason(polygon)))
     x, y = map(float, found.groups()) if found else shapely.get_coordinates(polygon)[0]
     return f"({x:.6g}, {y:.6g})"
-
-
-def _is_area(geometry: Any) -> bool:
-    return isinstance(geometry, shapely.Polygon) and geometry.area > 0.0

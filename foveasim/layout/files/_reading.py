@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
 from foveasim._core.names import CHANNEL_LETTERS
-from foveasim._core.rings import SITE_ID, positions_in_runs, ring_area_um2, site_ids
+from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import MAX_SITES, Floats, Ints
 from foveasim._io.formats import as_file_error
 from foveasim._io.sandbox import WALL_TIME_FACTOR, run_in_sandbox
@@ -35,6 +34,7 @@ from foveasim.layout.files._layers import (
     parse_selection,
 )
 from foveasim.layout.files._oasis_records import OASIS_MAGIC
+from foveasim.layout.files._outlines import valid_polygons, with_one_identity
 from foveasim.layout.files._source import Source
 from foveasim.layout.model import Layout
 from foveasim.layout.packed import check_sizes
@@ -44,8 +44,6 @@ MIN_READING_BYTES, READING_PER_BYTE = 2**30, 256
 MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 2**32, 256, 2**35
 MIN_STRING_BYTES, STRING_BYTES_PER_BYTE = 2**27, 32
 MAX_CPU_S, BYTES_PER_S = 5, 2**20
-#: Number of invalid outlines in a message.
-MAX_LISTED_OUTLINES = 50
 #: Number of names of missing cells in a message.
 MAX_LISTED_CELLS = 5
 
@@ -110,9 +108,9 @@ def read(
                 pieces.rings_um if is_undivided else _merge_parts(pieces, first), columns, about
             )
         except GeometryError:
-            polygons, kept = _valid_polygons(path, without_keyholes(_merge_parts(pieces, first)), invalid)
+            polygons, kept = valid_polygons(path, without_keyholes(_merge_parts(pieces, first)), invalid)
             layout = layout_from_untrusted(polygons, {name: c[kept] for name, c in columns.items()}, about)
-            layout = _with_one_identity(layout, kept)
+            layout = with_one_identity(layout, kept)
         if filters:
             # Sites of the layout with the outline of a filter: none of a skipped one, several of a repaired one.
             number = tags[piece, 8]
@@ -306,79 +304,6 @@ def _merge_parts(pieces: Layout, first: Ints) -> NDArray[Any]:
     for i in np.flatnonzero(size > 1):
         merged[i] = shapely.coverage_union_all(polygons[first[i] : first[i] + size[i]])
     return merged
-
-
-def _valid_polygons(path: Path, polygons: NDArray[Any], invalid: str) -> tuple[NDArray[Any], Ints]:
-    """
-    Return the valid polygons, repaired ones included, and their sites, ascending.
-
-    Raises FileError when a polygon is invalid, and ``invalid`` is ``"error"``, or no valid polygon remains. Raises
-    GeometryError when the layout is invalid for other reasons.
-    """
-    check_sizes(np.maximum(shapely.get_num_interior_rings(polygons), 0) + 1, shapely.get_num_coordinates(polygons))
-    n_sites, site = polygons.size, np.arange(polygons.size)
-    where: dict[int, str] = {}
-    while True:
-        try:
-            Layout.from_polygons(polygons)
-            break
-        except GeometryError as error:
-            bad = np.array(error.site_ids, np.int64)
-            if bad.size == 0:
-                raise
-        # Repaired ones are checked again, and skipped if they are still invalid.
-        new = [i for i in bad.tolist() if int(site[i]) not in where]
-        where |= {int(site[i]): _place(polygons[i]) for i in new}
-        parts = [(site[i], part) for i in new if invalid == "repair" for part in _repaired(polygons[i])]
-        polygons, site = np.delete(polygons, bad), np.delete(site, bad)
-        if parts:
-            site = np.append(site, [s for s, _ in parts])
-            order = np.argsort(site, kind="stable")
-            polygons, site = np.append(polygons, [part for _, part in parts])[order], site[order]
-        if site.size == 0:
-            break
-    if not where:
-        return polygons, site
-    shown = ", ".join(f"site {s} at {where[s]} µm" for s in sorted(where)[:MAX_LISTED_OUTLINES])
-    shown += f" and {len(where) - MAX_LISTED_OUTLINES} more" * (len(where) > MAX_LISTED_OUTLINES)
-    what = f"of {n_sites} outlines cross themselves or have no area"
-    if invalid == "error" or site.size == 0:
-        fix = "correct them" if site.size == 0 else "correct them, or pass invalid='skip' or invalid='repair'"
-        raise FileError(path, f"{len(where)} {what}, {shown}; {fix}")
-    n_skipped = n_sites - np.unique(site).size
-    n_repaired = len(where) - n_skipped
-    done = f"{n_skipped} are skipped" + f", {n_repaired} repaired" * (invalid == "repair")
-    warn(f"{path.name}: {len(where)} {what}, {shown}: {done}", LayoutWarning)
-    return polygons, site
-
-
-def _repaired(polygon: Any) -> list[Any]:
-    """Return all parts of an outline that touches itself, and the largest of one that crosses."""
-    parts = shapely.get_parts(shapely.make_valid(polygon))
-    parts = parts[shapely.area(parts) > 0.0]
-    if parts.size < 2:
-        return list(parts)
-    xy_um = shapely.get_coordinates(shapely.get_exterior_ring(polygon))
-    outline_um2 = abs(float(ring_area_um2(xy_um, np.array([0, len(xy_um)]))[0]))
-    # The winding order changes where an outline crosses itself, so that areas of its parts are subtracted from each other.
-    is_touching = abs(outline_um2 - shapely.area(parts).sum()) <= 1e-9 * outline_um2
-    return list(parts) if is_touching else [parts[np.argmax(shapely.area(parts))]]
-
-
-def _with_one_identity(layout: Layout, site: Ints) -> Layout:
-    """Return the layout with the identity of the first part for all parts of a site."""
-    is_part = np.append(False, site[1:] == site[:-1])
-    if not is_part.any():
-        return layout
-    ids = site_ids(layout)
-    return layout.with_columns(**{SITE_ID: ids[np.searchsorted(site, site)]})
-
-
-def _place(polygon: Any) -> str:
-    """Return the position of the problem of an outline, or its first vertex."""
-    found = re.search(r"\[(\S+) (\S+)\]", str(shapely.is_valid_reason(polygon)))
-    x, y = map(float, found.groups()) if found else shapely.get_coordinates(polygon)[0]
-    return f"({x:.6g}, {y:.6g})"
 
 
 def _columns(lines: bytes, tags: Ints, first: Ints) -> dict[str, NDArray[Any]]:
