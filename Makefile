@@ -74,7 +74,10 @@ test-torch: $(TORCH_VENV)/.installed
 # Files of other programs, which these write and read.
 test-interop: $(INTEROP_VENV)/.installed
 	FOVEASIM_TESTS=all FOVEASIM_TESTS_NEED=interop $(INTEROP_VENV)/bin/python -m pytest $(PARALLEL) tests/interop \
-		tests/distortion/test_calibration_files.py $(PYTEST_ARGS)
+		tests/distortion/test_calibration_files.py tests/_io/test_picture_colours.py tests/video/test_frame_times.py \
+		tests/video/test_video_colours.py $(PYTEST_ARGS)
+	FOVEASIM_TESTS=all $(INTEROP_VENV)/bin/python -m pytest $(PARALLEL) tests/layout/files/test_chip_records.py tests/maps/test_maps.py \
+		-k "klayout or gdstk or astropy" $(PYTEST_ARGS)
 
 # Kills workers at random for some minutes: every item must be computed, or have lost its worker three times.
 soak: $(VENV)/.installed-dev
