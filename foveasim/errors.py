@@ -194,10 +194,10 @@ class SimulationError(FoveasimError, RuntimeError):
     >>> import foveasim as fs
     >>> layout = fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0)
     >>> try:
-    ...     fs.modes.Shutter(layout, frame_s=0.04, line_s=1e-5)
+    ...     fs.Sensor(layout, filters="rgb")
     ... except fs.errors.SimulationError as error:
     ...     print(str(error).partition("; ")[0])
-    a rolling shutter needs the line of each site
+    the sensor has 3 filters, but the layout has no column 'channel'
     """
 
 

@@ -208,7 +208,7 @@ def test_invalid_setting_is_reported_with_key(shot_file, change, message):
         ("scene.pitch_um=abc", r'scene\.pitch_um: must be a valid number, got "abc"'),
         ("scene.pitchum=3", r"scene\.pitchum: unknown (key|parameter)"),
         ("scene.wavelength_nm=[550, x]", r'scene\.wavelength_nm\.1: must be a valid number, got "x"'),
-        ("scene.encoding=gamma", r"scene\.encoding: must be one of 'srgb', 'sqrt', 'linear', got \"gamma\""),
+        ("scene.encoding=gamma", r"scene\.encoding: must be one of 'auto', 'srgb', 'sqrt', 'linear', got \"gamma\""),
         ("scene.band_width_nm=[1.0, x]", r'scene\.band_width_nm\.1: must be a valid number, got "x"'),
         ("scene.picture=3", r"scene\.picture: must be a valid string, got 3"),
         (

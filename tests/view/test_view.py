@@ -236,8 +236,8 @@ def test_readout_lines_follow_readout_order():
     lines = axes.collections[1].get_segments()
 
     assert len(lines) == 3
-    assert [line.tolist() for line in lines] == [[[x, y] for y in (-3, -1, 1, 3)] for x in (-2, 0, 2)]
-    assert axes.collections[2].get_offsets().tolist() == [[x, -3] for x in (-2, 0, 2)]
+    assert [line.tolist() for line in lines] == [[[x, y] for y in (3, 1, -1, -3)] for x in (-2, 0, 2)]
+    assert axes.collections[2].get_offsets().tolist() == [[x, 3] for x in (-2, 0, 2)]
 
 
 def test_adjacency_draws_shared_edges():

@@ -88,7 +88,7 @@ def clean(layout: Layout, tolerance_um: Annotated[float, LENGTH]) -> tuple[Layou
     >>> import foveasim as fs
     >>> layout = fs.Layout.from_rectangles([[0.0, 0.0], [4.002, 0.0]], 4.0)  # a gap of 2 nm
     >>> closed, changes = fs.layout.clean(layout, 0.005)
-    >>> closed.area_um2.tolist(), changes[0].action
+    >>> closed.area_um2.round(3).tolist(), changes[0].action
     ([16.004, 16.004], 'snapped')
     """
     mesh = _snap(layout, tolerance_um)
