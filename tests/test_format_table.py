@@ -10,7 +10,7 @@ import pytest
 
 from foveasim.layout.files import FORMATS
 from foveasim.maps import MAP_FORMATS
-from foveasim.modes.event_files import EVENT_FORMATS
+from foveasim.modes._event_files import EVENT_FORMATS
 from foveasim.optics import PSF_FORMATS
 from foveasim.scene.cubes import CUBE_FORMATS
 

@@ -363,8 +363,7 @@ def test_command_of_videos_follows_a_path(files, axis):
 
     assert found.exit_code == 0, found.output
     recording = read_recording(files / "codes.zarr")
-    # Pictures of videos have the encoding of photographs.
-    shot = read_shot(files / "shot.yaml", ["scene.encoding=srgb"])
+    shot = read_shot(files / "shot.yaml")
     expected = shot.camera.capture(shot.scene, exposure_s=EXPOSURE_S, seed=1, gaze_um=GAZE_UM, axis=axis)
     assert recording.gaze_um.tolist() == [list(GAZE_UM), [0.0, 0.0]]
     assert np.array_equal(recording.code[0], expected.code)

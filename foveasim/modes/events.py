@@ -31,7 +31,7 @@ from foveasim.modes._addresses import (
     sites_at,
     too_many_addresses,
 )
-from foveasim.modes.event_files import TimeUnit, read_recording
+from foveasim.modes._event_files import TimeUnit, read_recording
 
 __all__ = ["Events", "write_events"]
 

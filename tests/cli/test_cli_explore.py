@@ -740,7 +740,7 @@ def test_invalid_dataset_option_writes_nothing(foveasim, folder, options, messag
         ("picture,label\na,1\n", "has no entry for 1 of 2 pictures, first 'b'; it contains 'a'"),
         ("picture,label\na,1\nb,1\na,2\n", "lists the picture 'a' twice, again in line 4"),
         ("picture,label\na,1\nb\n", "has 1 values in line 3, expected 2"),
-        ('picture,label\na,"1\n', "is not a valid CSV file"),
+        ('picture,label\na,"1\n', "line 2 cannot be split into columns"),
     ],
 )
 def test_invalid_class_file_is_rejected(tmp_path, text, message):

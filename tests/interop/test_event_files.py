@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from other_programs import other_program
 
-from foveasim.modes.event_files import read_recording
+from foveasim.modes._event_files import read_recording
 
 ARRAY = np.dtype([("t", np.int64), ("x", np.int16), ("y", np.int16), ("p", np.uint8)])
 

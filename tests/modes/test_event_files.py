@@ -10,7 +10,7 @@ import pytest
 import foveasim as fs
 from foveasim.errors import FileError, ParameterError
 from foveasim.modes import Events
-from foveasim.modes.event_files import read_recording
+from foveasim.modes._event_files import read_recording
 
 h5py = pytest.importorskip("h5py")
 

@@ -186,7 +186,8 @@ def test_other_transfers_are_named(tmp_path, transfer):
 
 def test_primaries_are_converted_to_srgb(tmp_path):
     # Linear Display P3 to linear sRGB, with the white D65 (matrices of colour-science).
-    colour = pytest.importorskip("colour")
+    with np.printoptions():  # its import changes them
+        colour = pytest.importorskip("colour")
     rng = np.random.default_rng(0)
     picture = rng.integers(120, 140, (16, 32, 3), dtype=np.uint8)
     names = {9: "ITU-R BT.2020", 12: "Display P3", 6: "SMPTE C"}

@@ -838,7 +838,7 @@ def test_corrupt_files_read_or_raise(small, tmp_path, extension):
         (b"{", "GeoJSON"),
         (b'{"type": "Topology"}', "not a GeoJSON FeatureCollection"),
         (b"{" + b'"a":{' * 100_000, "GeoJSON"),
-        (b'{"type": "FeatureCollection", "features": [1]}', "degrees of longitude and latitude"),
+        (b'{"type": "FeatureCollection", "features": [1]}', "feature 0 must be one polygon"),
         (b'{"type": "FeatureCollection", "features": [' + b"[" * 200_000, "GeoJSON"),
         (b"PK\x03\x04", "npz"),
         (b"PAR1" + bytes(50) + b"PAR1", "GeoParquet"),

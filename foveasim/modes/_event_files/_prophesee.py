@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._io.formats import FormatError
-from foveasim.modes.event_files._recording import MAX_EVENTS, Recording, shape_of
+from foveasim.modes._event_files._recording import MAX_EVENTS, Recording, shape_of
 
 #: Keys of headers that are read.
 UNDERSTOOD = frozenset(("evt", "format", "geometry", "width", "height", "version", "endianness", "end"))
@@ -99,7 +99,7 @@ def read_raw(path: Path, ignore: Collection[str] = ()) -> Recording:
 
 def _kernel_module() -> Any:
     """Return the kernels, which are compiled when they are imported."""
-    from foveasim.modes.event_files import _kernels
+    from foveasim.modes._event_files import _kernels
 
     return _kernels
 

@@ -8,10 +8,10 @@ from typing import Any
 
 from foveasim._io.formats import FileFormat, FormatError, as_file_error, detect_format
 from foveasim.errors import FileError, ParameterError
-from foveasim.modes.event_files._arrays import HDF5_SIGNATURE, is_text, read_hdf5, read_npy, read_text
-from foveasim.modes.event_files._inivation import read_aedat2, read_aedat4
-from foveasim.modes.event_files._prophesee import read_dat, read_raw
-from foveasim.modes.event_files._recording import TIME_UNITS, Recording, TimeUnit, empty_recording
+from foveasim.modes._event_files._arrays import HDF5_SIGNATURE, is_text, read_hdf5, read_npy, read_text
+from foveasim.modes._event_files._inivation import read_aedat2, read_aedat4
+from foveasim.modes._event_files._prophesee import read_dat, read_raw
+from foveasim.modes._event_files._recording import TIME_UNITS, Recording, TimeUnit, empty_recording
 
 __all__ = ["EVENT_FORMATS", "Recording", "TimeUnit", "read_recording"]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from foveasim._core.extras import import_optional
 from foveasim._io.formats import FormatError
 from foveasim._io.sandbox import read_in_sandbox
-from foveasim.modes.event_files._recording import MAX_EVENTS, Recording, shape_of
+from foveasim.modes._event_files._recording import MAX_EVENTS, Recording, shape_of
 
 #: Longest header of AEDAT 2.
 MAX_HEADER_BYTES = 1 << 20
