@@ -64,6 +64,7 @@ SCENE_ARGUMENTS: dict[str, dict[str, Any]] = {
 LAYOUT_FILE_ARGUMENTS = {
     "grid": {"stagger": False, "trench_um": 0.0},
     "quadtree": {"importance": "importance.png"},
+    "voronoi_of": {"points_um": [[3.1 * (k % 8) - 10.8 + 0.4 * (k % 3), 3.0 * (k // 8) - 7.5] for k in range(48)]},
 }
 EDIT_FILE_ARGUMENTS: dict[str, dict[str, Any]] = {
     "overlay": {
