@@ -290,10 +290,6 @@ def convert(
             "--max-vertices", help="Maximum vertices of a polygon in a GDSII or OASIS file; others are divided."
         ),
     ] = None,
-    invalid: Annotated[
-        str | None,
-        typer.Option("--invalid", help="Invalid outlines of SOURCE: error, skip or repair."),
-    ] = None,
 ) -> None:
     """Convert a layout to another file format, and report rounding and dropped columns."""
     from foveasim.config import read_any_layout
@@ -301,7 +297,7 @@ def convert(
     from foveasim.layout.files import layer_options
 
     options = _reading_options(source_layer, channels, source_cell, centre, reading)
-    layout = read_any_layout(source, **({} if invalid is None else {"invalid": invalid}) | options).layout
+    layout = read_any_layout(source, **options).layout
     written = write_layout(
         layout, target, dbu_um=dbu_um, max_vertices=max_vertices, **layer_options(layer or [], layers)
     )

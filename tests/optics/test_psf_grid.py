@@ -846,7 +846,7 @@ def test_wrong_text_of_an_index_is_rejected(tmp_path, text, message):
         ("row 5, column 4", "(5, 4)", r"has the unknown line 'Center point is: \(5, 4\)' in its header"),
         ("0.250000000 µm", "1,250.0 µm", "has the number '1,250.0' in its header, expected one decimal point or comma"),
         ("0.5500 to 0.5500", "0.4500 to 0.6500", "is the PSF of 0.45 to 0.65 µm; export one wavelength per file"),
-        ("0.250000000 µm", "0.250000000 in", "has the unit of length 'in', expected µm"),
+        ("0.250000000 µm", "0.250000000 ft", "has the unit of length 'ft', expected one such as µm"),
         ("Image grid size: 8 by 8", "Image grid size: 8 by 9", "has 64 values, expected 8 by 9 = 72"),
         ("Image grid size: 8 by 8", "Image grid size: 80000 by 80000", "more than the limit of 8192 along a side"),
         ("1.000000000E+00", "one", "has a value that is not a number"),

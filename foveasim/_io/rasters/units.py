@@ -22,7 +22,9 @@ _BASE: dict[str, tuple[float, Powers]] = {
     "J": (1.0, (1, 0, 1, 0, 0)),
     "erg": (1e-7, (1, 0, 1, 0, 0)),
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), (1.0, _METRE)),
-    "cm": (1e-2, _METRE),
+    **dict.fromkeys(("cm", "centimetre", "centimetres", "centimeter", "centimeters"), (1e-2, _METRE)),
+    **dict.fromkeys(("in", "inch", "inches"), (2.54e-2, _METRE)),
+    **dict.fromkeys(("mil", "mils"), (2.54e-5, _METRE)),
     **dict.fromkeys(("mm", "millimetre", "millimetres", "millimeter", "millimeters"), (1e-3, _METRE)),
     **dict.fromkeys(
         ("um", "micron", "microns", "micrometre", "micrometres", "micrometer", "micrometers"), (1e-6, _METRE)

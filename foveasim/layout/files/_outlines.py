@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 import shapely
@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 
 from foveasim._core.rings import SITE_ID, ring_area_um2, site_ids
 from foveasim._core.validation import Floats, Ints
+from foveasim._io.rasters.units import length_in_um
 from foveasim.errors import FileError, GeometryError, LayoutWarning, warn
 from foveasim.layout.files._common import layout_from_untrusted
 from foveasim.layout.model import Layout
 from foveasim.layout.packed import check_sizes
 
-#: Units of length that users may state, in µm.
-LENGTHS_UM = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6, "mil": 25.4, "in": 25400.0}
+#: Units of length that users may state, and their sizes in µm.
 LengthUnit: TypeAlias = Literal["nm", "um", "mm", "cm", "m", "mil", "in"]
+LENGTHS_UM: dict[str, float] = {unit: length_in_um(unit) or 0.0 for unit in get_args(LengthUnit)}
 Invalid: TypeAlias = Literal["error", "skip", "repair"]
 Parts: TypeAlias = Literal["error", "split", "largest"]
 

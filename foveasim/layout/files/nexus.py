@@ -26,6 +26,7 @@ from foveasim._core.extras import import_optional
 from foveasim._core.validation import Floats, Ints
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, FormatError, as_file_error
+from foveasim._io.rasters.units import length_in_um
 from foveasim._io.sandbox import read_in_sandbox
 from foveasim.errors import FileError, GeometryError
 from foveasim.layout.files._common import (
@@ -41,7 +42,6 @@ from foveasim.layout.files._common import (
     table_header,
 )
 from foveasim.layout.files._outlines import (
-    LENGTHS_UM,
     Invalid,
     LengthUnit,
     Parts,
@@ -75,15 +75,6 @@ IRRELEVANT = frozenset((
     "underload_value", "countrate_correction_applied", "pixel_mask", "pixel_mask_applied", "flatfield_applied",
     "dead_time", "gain_setting", "layout", "threshold_energy", "frame_start_number", "trigger_mode",
 ))  # fmt: skip
-#: Units of length in attributes, in µm.
-UNITS_UM = {
-    **LENGTHS_UM,
-    **dict.fromkeys(("metre", "meter", "metres", "meters"), 1e6),
-    **dict.fromkeys(("millimetre", "millimeter", "millimetres", "millimeters"), 1e3),
-    **dict.fromkeys(("µm", "μm", "micron", "microns", "micrometre", "micrometer", "micrometres", "micrometers"), 1.0),
-    **dict.fromkeys(("nanometre", "nanometer", "nanometres", "nanometers"), 1e-3),
-    **dict.fromkeys(("inch", "inches"), 25400.0),
-}
 #: Orientations of pyFAI: whether x and y decrease with the index of a pixel.
 FLIPS = {1: (True, True), 2: (False, True), 3: (False, False), 4: (True, False)}
 #: Largest number of objects in a file, and of corners relative to the vertices of a layout that are written for pyFAI.
@@ -247,9 +238,10 @@ _Shapes: TypeAlias = _Rings | NDArray[Any]
 def _unit_um(path: Path, name: str, unit: LengthUnit | None) -> float:
     if not name:
         return required_unit(path, unit, "has vertices without the attribute 'units'")
-    if name not in UNITS_UM:
+    stated_um = length_in_um(name)
+    if stated_um is None:
         raise FileError(path, f"has the unit {name!r:.40}, expected a length such as m, mm or um")
-    return agreed_unit(path, unit, UNITS_UM[name], name)
+    return agreed_unit(path, unit, stated_um, name)
 
 
 def _of_faces(path: Path, found: dict[str, NDArray[Any]]) -> tuple[_Shapes, dict[str, Any]]:

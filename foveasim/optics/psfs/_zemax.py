@@ -26,6 +26,7 @@ import numpy as np
 
 from foveasim._core.validation import Floats
 from foveasim._io.formats import FileFormat, FormatError, as_file_error, listed_file
+from foveasim._io.rasters.units import length_in_um
 from foveasim._io.text_files import read_text
 from foveasim._io.yaml_files import MAX_FILE_BYTES as MAX_INDEX_BYTES
 from foveasim._io.yaml_files import parse_yaml
@@ -36,8 +37,6 @@ from foveasim.optics.psfs._grid import CENTRES, MAX_POINTS, MAX_SIDE, MAX_VALUES
 TITLE = re.compile(r"\s*Listing of (FFT|Huygens) PSF Data")
 #: Largest size of a listing: 2048 x 2048 values of 16 characters in UTF-16.
 MAX_BYTES = 2**27
-#: Lengths in µm of the units of listings; "µ" in the encodings of OpticStudio.
-UNITS_UM = {"µm": 1.0, "μm": 1.0, "um": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
 NUMBER = r"([-+]?[\d.,]{1,32}(?:[eE][-+]?\d{1,4})?)"
 WAVES = re.compile(rf"{NUMBER}(?:\s+to\s+{NUMBER})?\s*([^\W\d_]{{1,4}}|µm|μm)\s+at\s", re.IGNORECASE)
 SPACING = re.compile(rf"Data spacing is\s+{NUMBER}\s*(\S+?)\.?$")
@@ -169,9 +168,10 @@ def _text(path: Path) -> str:
 
 def _unit_um(name: str) -> float:
     unit = name.rstrip(".,:;")
-    if unit not in UNITS_UM:
-        raise FormatError(f"has the unit of length {unit!r:.20}, expected {', '.join(UNITS_UM)}")
-    return UNITS_UM[unit]
+    size_um = length_in_um(unit)
+    if size_um is None:
+        raise FormatError(f"has the unit of length {unit!r:.20}, expected one such as µm, nm or mm")
+    return size_um
 
 
 def read_one(path: Path, *, wavelength_nm: Any = None, centre: Any = None) -> PSFGrid:

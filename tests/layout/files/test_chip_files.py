@@ -934,7 +934,7 @@ def test_invalid_outlines_are_repaired(invalid_file):
 @pytest.mark.parametrize("invalid_file", ["gds"], indirect=True)
 def test_command_line_skips_invalid_outlines(invalid_file, tmp_path):
     command = ["convert", str(invalid_file), str(tmp_path / "b.npz"), "--source-layer", "77"]
-    skipping, failing = run_programs([*command, "--invalid", "skip"], command, cwd=tmp_path)
+    skipping, failing = run_programs([*command, "--reading", "invalid=skip"], command, cwd=tmp_path)
 
     for result, status in ((skipping, 0), (failing, 2)):
         assert result.returncode == status
