@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
 import inspect
 import pkgutil
@@ -15,16 +14,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import shapely
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from PIL import Image, ImageOps
+from skimage.color import rgb2gray
+from skimage.data import astronaut
 
 import foveasim.view
+from foveasim import Integrator, PowerMap
 from foveasim._core.quantities import format_quantity
 from foveasim._core.registry import Registry
 from foveasim._io.yaml_files import first_comment
 from foveasim.config import bundled_layouts, read_layout_file
 from foveasim.layout import LAYOUTS
 from foveasim.scene import SCENES
+from foveasim.view import plot_layout
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -89,6 +96,8 @@ REFERENCE = Path(__file__).parent / "reference"
 BUNDLED = Path(__file__).parent / "layouts"
 #: Photosites around the centre in the right part of their figures; differences of size below this are rounding.
 N_NEAR, SAME_SIZE_UM = 150, 1e-6
+#: Smallest and largest size of the scale of colours of all bundled layouts.
+SIZES_UM = (0.5, 400.0)
 #: Size of thumbnails of the gallery, and height over width of the part that they show.
 THUMBNAIL_PX, TALLEST = (480, 360), 0.9
 #: Chapters of the gallery, those of the guides, with the numbers of their scripts; others follow at the end.
@@ -251,20 +260,32 @@ def write_layouts(_app: Sphinx, _config: Config) -> None:
         sections.append(f"## {name}\n\n{title} {figures}\n\n![{title}]({name}.png)\n\nSource: {source}")
     about = (
         "Each name stands for a layout in every command, and in `fs.read_layout`: `foveasim view giotto_2`. The files are in "
-        "`layouts/`, with design rules that they satisfy."
+        "`layouts/`, with design rules that they satisfy. Colours of sizes have one scale for all layouts; the "
+        "photograph is the mean irradiance of each photosite, without noise."
     )
     (BUNDLED / "index.md").write_text("\n\n".join(["# Bundled layouts", about, *sections]) + "\n")
 
 
 def figure_of(layout: Layout) -> Figure:
-    """Draw a layout, and its photosites around the centre."""
-    figure = Figure(figsize=(7.4, 3.7), layout="constrained")
-    whole, part = figure.subplots(1, 2)
+    """Draw the sizes of photosites on the scale of all layouts, a photograph through them, and those around the centre."""
+    figure = Figure(figsize=(8.0, 2.9), layout="constrained")
+    sizes, seen, part = figure.subplots(1, 3)
     x0, y0, x1, y1 = layout.bounds_um
     centre_um = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
-    has_channels = layout.channel.max() > 0
-    by = "channel" if has_channels else "size_um" if np.ptp(layout.size_um) > SAME_SIZE_UM else None
-    layout.plot(by, ax=whole, legend=not has_channels)
+    scale = ScalarMappable(LogNorm(*SIZES_UM), "viridis_r")
+    size_colours = scale.to_rgba(layout.size_um)[:, :3]
+    plot_layout(layout, size_colours, ax=sizes)
+    bar = figure.colorbar(scale, ax=sizes, orientation="horizontal", label="size / µm")
+    bar.ax.minorticks_off()
+    bar.set_ticks([1, 10, 100], labels=["1", "10", "100"])
+    side_um = max(x1 - x0, y1 - y0)
+    face = rgb2gray(astronaut()[0:260, 95:355])[::-1]
+    power_map = PowerMap.from_array(face, pitch_um=side_um / face.shape[0], wavelength_nm=550.0)
+    moved = layout.translate(*-centre_um)
+    mean = Integrator(moved, power_map.grid)(power_map.data)[0] / layout.area_um2
+    plot_layout(layout, np.clip(mean, 0.0, 1.0)[:, np.newaxis].repeat(3, axis=1), ax=seen, scale_bar=False)
+    for axes in (sizes, seen):
+        axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
     offset_um = layout.centroid_um - centre_um
     radius_um = np.hypot(*offset_um.T)
     innermost = np.flatnonzero(radius_um < 1.01 * radius_um.min() + SAME_SIZE_UM)
@@ -274,9 +295,20 @@ def figure_of(layout: Layout) -> Figure:
     distance_um = np.hypot(*(layout.centroid_um - centre_um).T)
     near = min(N_NEAR, layout.n_sites - 1)
     reach_um = np.partition(distance_um, near)[near]
-    layout[distance_um < 2.0 * reach_um].plot("channel" if has_channels else None, ax=part, legend=False)
+    is_near = distance_um < 2.0 * reach_um
+    if layout.channel.max() > 0:
+        layout[is_near].plot("channel", ax=part, legend=False)
+    else:
+        plot_layout(layout[is_near], size_colours[is_near], ax=part)
+        rings = shapely.get_rings(layout[is_near].polygons())
+        part.add_collection(
+            LineCollection([shapely.get_coordinates(ring) for ring in rings], colors="0.2", linewidths=0.6)
+        )
     part.set_xlim(centre_um[0] - reach_um, centre_um[0] + reach_um)
     part.set_ylim(centre_um[1] - reach_um, centre_um[1] + reach_um)
+    part.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    for axes, title in ((sizes, "sizes"), (seen, "a photograph"), (part, "around the centre")):
+        axes.set_title(title, fontsize=11)
     return figure
 
 
@@ -293,6 +325,7 @@ def write_thumbnail(picture: Path, thumbnail: Path) -> None:
 def write_gallery(_app: Sphinx, _config: Config) -> None:
     """Run every script of the gallery; write a page with its question, pictures and source, and an index of cards."""
     from dark_figures import SUFFIX, with_dark_variants
+    from gallery_pages import page_of, read_script
 
     cards: dict[int, str] = {}
     for script in gallery_scripts(REPOSITORY):
@@ -305,7 +338,6 @@ def write_gallery(_app: Sphinx, _config: Config) -> None:
                 runpy.run_path(str(script))["main"](folder)
             done.touch()
         title = script.stem[3:].replace("_", " ").capitalize()
-        description = (ast.get_docstring(ast.parse(script.read_text())) or "").replace("``", "`")
         pictures = [
             f"{script.stem}/{picture.name}"
             for picture in sorted(folder.glob("*.*"))
@@ -315,14 +347,9 @@ def write_gallery(_app: Sphinx, _config: Config) -> None:
             kept = sorted(PICTURES.glob(f"{script.stem[:2]}_*.png"))
             pictures = [f"../pictures/{picture.name}" for picture in kept if not picture.stem.endswith(SUFFIX)]
             folder.mkdir(parents=True, exist_ok=True)
-            description += f"\n\n{WITHOUT_TORCH}"
-        shown = "\n\n".join(f"![{picture}]({picture})" for picture in pictures)
-        source = (
-            f"```{{literalinclude}} ../../gallery/{script.name}\n:language: python\n:start-at: from __future__\n```"
-        )
-        text = f"# {title}\n\n{description}\n\n{shown}\n\n## gallery/{script.name}\n\n{source}\n"
-        (GALLERY / f"{script.stem}.md").write_text(text)
-        question = description.partition("\n")[0]
+        page = page_of(script, title, pictures, WITHOUT_TORCH if is_skipped else "")
+        (GALLERY / f"{script.stem}.md").write_text(page)
+        question = read_script(script).question
         if pictures:
             write_thumbnail(GALLERY / pictures[0], folder / "thumbnail.jpg")
         thumbnail = f":img-top: {script.stem}/thumbnail.jpg\n:img-alt: {title}\n" if pictures else ""

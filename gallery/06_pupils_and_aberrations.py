@@ -27,6 +27,8 @@ WAVELENGTH_NM = 550.0
 DISTANCE_M = 0.5
 #: Spacing of the points of the field.
 SPACING_MM = 3.6
+#: Half the side of the PSFs.
+EXTENT_UM = 14.0
 LENS = {"focal_length_mm": 10.0, "f_number": 4.0}
 LIGHT = {"distance_m": DISTANCE_M, "wavelength_nm": [WAVELENGTH_NM], "band_width_nm": 10.0}
 #: Wavefront error for a Strehl ratio of about 0.8 (Marechal criterion), waves rms.
@@ -40,21 +42,64 @@ def half_moon(x: np.ndarray, y: np.ndarray, wavelength_nm: float) -> np.ndarray:
     return (y > 0.0) * (1.0 - 0.4 * (1.0 + x))
 
 
-def lenses() -> dict[str, fs.Optics]:
-    """Return lenses that differ in the pupil or in one aberration."""
-    waves = {"unit": "waves", "wavelength_nm": WAVELENGTH_NM}
+def pupils() -> dict[str, fs.Optics]:
+    """Return lenses that differ in the pupil."""
     return {
         "clear circle": fs.Optics(**LENS),
         "annulus": fs.Optics(pupil=parts.Annulus(0.5), **LENS),
         "three vanes": fs.Optics(pupil=(parts.Annulus(0.3), parts.Spider(3, 0.03, angle_deg=90.0)), **LENS),
         "five blades": fs.Optics(pupil=parts.Blades(5, angle_deg=90.0), **LENS),
-        "slit": fs.Optics(pupil=parts.Slit(0.25), **LENS),
         "user function": fs.Optics(pupil=half_moon, **LENS),
+    }
+
+
+def aberrations() -> dict[str, fs.Optics]:
+    """Return lenses that differ in one aberration."""
+    waves = {"unit": "waves", "wavelength_nm": WAVELENGTH_NM}
+    return {
+        "no aberration": fs.Optics(**LENS),
         "defocus": fs.Optics(focus_distance_m=0.65, **LENS),
         "coma in y": fs.Optics(zernike=parts.Zernike(coefficients={7: 0.3}, **waves), **LENS),
         "astigmatism": fs.Optics(zernike=parts.Zernike(coefficients={6: 0.25}, **waves), **LENS),
         "spherical": fs.Optics(zernike=parts.Zernike(coefficients={11: 0.25}, **waves), **LENS),
     }
+
+
+def draw(lenses: dict[str, fs.Optics], n_frequencies: int) -> Figure:
+    """Draw the PSF and the image of a letter of each lens, and the MTF of all along x and y."""
+    letter = charts.letter_f(
+        height_mm=3.0, shape=(160, 160), pitch_um=32.0, radiance_w_m2_sr_nm=0.1, contrast=1.0, **LIGHT
+    )
+    per_mm = np.linspace(0.0, 460.0, n_frequencies)
+    figure = Figure(figsize=(8.0, 6.6), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 0.9))
+    mtf = below.add_subplot()
+    for k, ((name, lens), column) in enumerate(zip(lenses.items(), above.subplots(2, len(lenses)).T, strict=True)):
+        psf = lens.psf(WAVELENGTH_NM, distance_m=DISTANCE_M)
+        highest = psf.psf_per_um2.max()
+        left, bottom, right, top = psf.grid.bounds_um
+        column[0].imshow(
+            psf.psf_per_um2 + 1e-9,
+            origin="lower",
+            extent=(left, right, bottom, top),
+            norm=LogNorm(1e-4 * highest, highest),
+            cmap="magma",
+        )
+        column[0].set(xlim=(-EXTENT_UM, EXTENT_UM), ylim=(-EXTENT_UM, EXTENT_UM))
+        column[0].set_title(f"{name}\nStrehl {lens.strehl(WAVELENGTH_NM, distance_m=DISTANCE_M):.2f}", fontsize=11)
+        column[1].imshow(lens.power_map(letter).data[0], origin="lower", cmap="gray", vmin=0.0)
+        for axes in column:
+            axes.set(xticks=[], yticks=[])
+        for angle_deg, style in ((0.0, "-"), (90.0, "--")):
+            contrast = lens.mtf(per_mm, WAVELENGTH_NM, angle_deg=angle_deg, distance_m=DISTANCE_M)
+            mtf.plot(per_mm, contrast, style, color=f"C{k}", label=name if angle_deg == 0.0 else None)
+    above.axes[0].set_ylabel(f"PSF, {2 * EXTENT_UM:.0f} µm")
+    above.axes[len(lenses)].set_ylabel("letter")
+    mtf.plot([], [], "--", color="0.5", label="along y")
+    mtf.set(xlabel="spatial frequency / (lp/mm)", ylabel="MTF", ylim=(0.0, 1.0), xlim=(0.0, per_mm[-1]))
+    mtf.grid(color="0.85")
+    mtf.legend(frameon=False)
+    return figure
 
 
 def enlarged(power_map: fs.PowerMap, spacing_um: float) -> np.ndarray:
@@ -74,40 +119,11 @@ def enlarged(power_map: fs.PowerMap, spacing_um: float) -> np.ndarray:
 def main(out_dir: Path, n_frequencies: int = 200) -> None:
     """Write PSFs, letters and a field of points to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
-    # %% PSF, image of a letter and MTF of each lens.
-    all_lenses = lenses()
-    letter = charts.letter_f(
-        height_mm=3.0, shape=(160, 160), pitch_um=32.0, radiance_w_m2_sr_nm=0.1, contrast=1.0, **LIGHT
-    )
-    per_mm = np.linspace(0.0, 460.0, n_frequencies)
-    figure = Figure(figsize=(8.0, 9.6), layout="constrained")
-    axes = figure.subplots(6, 5)
-    columns = np.hstack((axes[:3], axes[3:])).T  # five lenses above, five below
-    for column, (name, lens) in zip(columns, all_lenses.items(), strict=True):
-        psf = lens.psf(WAVELENGTH_NM, distance_m=DISTANCE_M)
-        left, bottom, right, top = psf.grid.bounds_um
-        highest = psf.psf_per_um2.max()
-        column[0].imshow(
-            psf.psf_per_um2 + 1e-9,
-            origin="lower",
-            extent=(left, right, bottom, top),
-            norm=LogNorm(1e-4 * highest, highest),
-            cmap="magma",
-        )
-        column[0].set_title(f"{name}\nStrehl {lens.strehl(WAVELENGTH_NM, distance_m=DISTANCE_M):.2f}", fontsize=10)
-        column[1].imshow(lens.power_map(letter).data[0], origin="lower", cmap="gray", vmin=0.0)
-        column[1].set_axis_off()
-        for angle_deg, label in ((0.0, "along x"), (90.0, "along y")):
-            column[2].plot(
-                per_mm, lens.mtf(per_mm, WAVELENGTH_NM, angle_deg=angle_deg, distance_m=DISTANCE_M), label=label
-            )
-        column[2].set_ylim(0.0, 1.0)
-        column[2].set_xlabel("lp/mm")
-    for row in (0, 3):
-        axes[row, 0].set_ylabel("y / µm")
-        axes[row + 2, 0].set_ylabel("MTF")
-    figure.legend(*axes[2, 0].get_legend_handles_labels(), ncols=2, frameon=False, loc="outside lower center")
-    save_figure(figure, out_dir / "06_pupils.png", dpi=140)
+    # %% Pupils of different shapes.
+    save_figure(draw(pupils(), n_frequencies), out_dir / "06_pupils.png", dpi=140)
+
+    # %% Aberrations of a circular pupil.
+    save_figure(draw(aberrations(), n_frequencies), out_dir / "06_aberrations.png", dpi=140)
 
     # %% Field of points through a lens with coma and astigmatism that increase with field height.
     points = charts.point_grid(shape=(360, 480), pitch_um=60.0, spacing_mm=SPACING_MM, intensity_w_sr_nm=1e-6, **LIGHT)
@@ -135,7 +151,7 @@ def main(out_dir: Path, n_frequencies: int = 200) -> None:
     displaced = field.field_error(points)
     print(f"7 x 7 isoplanatic patches displace up to {displaced:.1%} of the PSF energy")
     assert abs(displaced - 0.335) < 0.02
-    coma = all_lenses["coma in y"].psf(WAVELENGTH_NM)
+    coma = aberrations()["coma in y"].psf(WAVELENGTH_NM)
     weight = coma.psf_per_um2 / coma.psf_per_um2.sum()
     assert float((weight * coma.grid.y_um[:, np.newaxis]).sum()) > 1.0
 

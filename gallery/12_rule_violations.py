@@ -1,7 +1,7 @@
 """
 Where does a layout violate its design rules, and by how much?
 
-New here: ``Layout.check`` on a layout with deliberate violations, ``Report.plot``, ``Layout.plot`` with overlays.
+New here: ``Layout.check`` on a layout with deliberate violations, ``Report.plot``.
 
 Expect: the 2 slivers, 1 overlap, 2 pixels below the minimum size and 1 narrow space that are inserted into a grid of 60 sites,
 and no other violation.
@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from matplotlib.figure import Figure
 
 import foveasim as fs
 from foveasim.view import save_figure
@@ -50,30 +49,24 @@ def layout_with_violations() -> fs.Layout:
     sites[8] = shapely.box(x0 - 1.0 - OVERLAP_UM, y0, x0 + 2.0, y1)
     x0, y0, x1, _ = boxes[42]
     sites[42] = shapely.box(x0, y0, x1, y0 + 4.0 - SPACE_UM)
-    return fs.layout.readout_by(fs.Layout.from_polygons(sites, **regular.columns), "column")
+    return fs.Layout.from_polygons(sites, **regular.columns)
 
 
 def main(out_dir: Path) -> None:
-    """Write the layout, its readout lines and its violations to a directory."""
+    """Write the layout and its violations to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
     layout = layout_with_violations()
     report = layout.check(RULES)
 
-    # %% Sizes of the sites with readout lines, and names of what is inserted.
-    figure = Figure(figsize=(8.0, 5.4), layout="constrained")
-    axes = figure.add_subplot()
-    layout.plot("size_um", overlay="readout_lines", scale_bar=False, ax=axes)
+    # %% Photosites in grey, violations in the colours of their rules, and the names of what is inserted.
+    print(report)
+    axes = report.plot(layout, figure_inches=8.0)
     for site, text in INSERTED.items():
         arrow = {"arrowstyle": "->", "color": "black"}
         box = {"boxstyle": "round", "facecolor": "white", "edgecolor": "0.6"}
         x_um, y_um = layout.centroid_um[site]
-        at_um = (x_um + (3.2 if x_um < 0.0 else -3.2), y_um + 2.9)
+        at_um = (x_um + (3.2 if x_um < 0.0 else -3.2), y_um + (2.9 if y_um < 0.0 else -2.9))
         axes.annotate(text, (x_um, y_um), at_um, arrowprops=arrow, bbox=box, ha="center", fontsize=10)
-    save_figure(figure, out_dir / "12_layout.png", dpi=140)
-
-    # %% Violations.
-    print(report)
-    axes = report.plot(layout, figure_inches=8.0)
     save_figure(axes.figure, out_dir / "12_violations.png", dpi=140)
 
     # %% Checks.

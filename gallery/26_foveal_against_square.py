@@ -63,11 +63,15 @@ def draw(found: fs.compare.Comparison) -> Figure:
 def main(out_dir: Path, n_sites: int = N_SITES) -> None:
     """Write the figure to a directory, and check the differences."""
     out_dir.mkdir(parents=True, exist_ok=True)
+    # %% Five photographs through both sensors.
     found = compare(n_sites)
-    figure = draw(found)
-    save_figure(figure, out_dir / "26_foveal_against_square.png", dpi=140)
     print(found)
 
+    # %% Pictures of one scene, and measures against eccentricity; bands are 95 % intervals of the median over the scenes.
+    figure = draw(found)
+    save_figure(figure, out_dir / "26_foveal_against_square.png", dpi=140)
+
+    # %% Checks.
     foveal, square = found.summary("psnr_db", by_eccentricity=True).median
     per_mm2 = found.summary("information_bit_per_mm2", by_eccentricity=True).median
     total = found.summary("information_bit_per_site").median

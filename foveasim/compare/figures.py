@@ -28,19 +28,26 @@ COLOURS = ("#2f7fd6", "#e0862a", "#1f9e77", "#c95fb0", "#8a8f2e", "#c8474b", "#7
 MARKERS = "osD^vP*X"
 FIGURE_INCHES = (4.7, 3.1)
 MAX_NAME = 28
+#: Entry of the bands in a legend.
+BAND = "95 % interval"
 
 
 def draw_measure(comparison: Comparison, name: str, axes: Axes) -> None:
-    """Draw one metric of all cameras against eccentricity, with confidence intervals."""
+    """Draw one metric of all cameras against eccentricity, with 95 % intervals of the median over the scenes."""
     info = metric_info(name)
     intervals = comparison.summary(name, by_eccentricity=True)
     r_um = 0.5 * (comparison.edges_um[1:] + comparison.edges_um[:-1])
+    is_labelled = False
     for k, interval in enumerate(zip(*intervals, strict=True)):
         is_finite = np.isfinite(interval[0])
         x, y, low, high = (part[is_finite] for part in (r_um, *interval))
         axes.plot(x, y, linewidth=1.6, markersize=4, **_line_of(comparison, k))
         if info.has_scene and np.isfinite(high - low).any():
-            axes.fill_between(x, low, high, color=COLOURS[k % len(COLOURS)], alpha=0.16, linewidth=0.0)
+            colour = COLOURS[k % len(COLOURS)]
+            axes.fill_between(
+                x, low, high, color=colour, alpha=0.16, linewidth=0.0, label=None if is_labelled else BAND
+            )
+            is_labelled = True
     finite = intervals.median[np.isfinite(intervals.median)]
     if info.is_logarithmic and finite.size and (finite > 0.0).all():
         axes.set_yscale("log")
@@ -86,8 +93,10 @@ def overview(comparison: Comparison) -> NDArray[Any]:
             _style(one, "black", "0.9")
         for one in axes[len(draws) :]:
             one.set_visible(False)
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+        entries = {
+            label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(entries.values(), list(entries), loc="outside upper center", ncols=len(entries), frameon=False)
     return axes[: len(draws)]
 
 

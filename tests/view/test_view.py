@@ -455,7 +455,7 @@ def test_unknown_format_raises_without_output(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_noise_budget_bars_per_source_and_class():
+def test_noise_budget_has_dots_per_source_and_class():
     layout = fs.layout.grid(n_x=4, n_y=1, pitch_um=2.0)
     sensor = fs.Sensor(layout, read_noise_e=[3.0, 3.0, 5.0, 5.0], prnu_fraction=0.01)
     noise_e = fs.sensor.noise_budget(sensor, np.full(4, 400.0), 1.0)
@@ -465,10 +465,10 @@ def test_noise_budget_bars_per_source_and_class():
 
     names = [text.get_text() for text in together.get_yticklabels()]
     assert names == ["photon_shot", "read", "quantisation", "prnu"]
-    widths = [bar.get_width() for bar in together.patches]
-    assert widths[0] == pytest.approx(20.0 * np.sqrt(sensor.response.mean()))
-    assert widths[1] == pytest.approx(np.sqrt(17.0))
-    assert [bar.get_width() for bar in grouped.patches][1::4] == pytest.approx([3.0, 5.0])
+    (dots,) = together.lines
+    assert dots.get_xdata()[:2] == pytest.approx([20.0 * np.sqrt(sensor.response.mean()), np.sqrt(17.0)])
+    assert [line.get_xdata()[1] for line in grouped.lines] == pytest.approx([3.0, 5.0])
+    assert together.get_ylim()[0] > together.get_ylim()[1]
     with pytest.raises(ParameterError, match="'classes' must have one value for each of the 4 sites"):
         plot_noise_budget(noise_e, classes=[0, 1])
 

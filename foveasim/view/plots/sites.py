@@ -201,14 +201,14 @@ def plot_noise_budget(
     noise_e: Mapping[str, Floats], *, classes: ArrayLike | None = None, ax: Axes | None = None
 ) -> Axes:
     """
-    Draw the noise budget as bars of the RMS of every source, temporal sources on top.
+    Draw the noise budget: one dot for the RMS of every source on a logarithmic scale, temporal sources on top.
 
     Parameters
     ----------
     noise_e : mapping of (n_site,) arrays, e-
         From :func:`foveasim.sensor.noise_budget`.
     classes : (n_site,) integers, optional
-        Sites with the same number share bars, for example a column of sizes or the channel; by default all sites do.
+        Sites with the same number share dots, for example a column of sizes or the channel; by default all sites do.
     ax : matplotlib axes, optional
         New axes by default.
 
@@ -239,18 +239,15 @@ def plot_noise_budget(
     check_per_site("classes", labels, n_sites)
     shown = {name: values for name, values in noise_e.items() if np.any(values > 0.0)}
     groups = np.unique(labels)
-    for k, group in enumerate(groups):
+    for group in groups:
         rms_e = [float(np.sqrt(np.mean(values[labels == group] ** 2))) for values in shown.values()]
-        positions = np.arange(len(shown)) + (k - 0.5 * (groups.size - 1)) * 0.8 / groups.size
-        ax.barh(
-            positions,
-            rms_e,
-            height=0.8 / groups.size,
-            label=None if groups.size == 1 else f"class {group}",
-        )
+        # Dots: the length of a bar would depend on where a logarithmic axis begins.
+        ax.plot(rms_e, range(len(shown)), "o", markersize=7, label=None if groups.size == 1 else f"class {group}")
     ax.set_yticks(range(len(shown)), list(shown))
-    ax.invert_yaxis()
+    ax.set_ylim(len(shown) - 0.5, -0.5)
     ax.set_xscale("log")
+    ax.grid(color="0.85")
+    ax.set_axisbelow(True)
     ax.set_xlabel("noise / e- rms")
     if groups.size > 1:
         ax.legend()

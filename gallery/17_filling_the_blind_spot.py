@@ -15,7 +15,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import shapely
 from matplotlib.figure import Figure
 from skimage.data import astronaut
 
@@ -25,7 +24,6 @@ from foveasim.view import save_figure
 MIN_SIZE_UM = 2.0
 #: Grid of the centre, with pixels of 0.5 µm.
 CENTRE = fs.Grid((520, 520), 0.5, (-130.0, -130.0))
-INNER_BOUNDS_UM = (-10.0, -10.0, 72.0, 72.0)
 FOVEAS = {"none": "blind spot", "hexagons": "hexagons", "rings": "rings", "linear": "linear rings"}
 
 
@@ -42,11 +40,12 @@ def main(out_dir: Path) -> None:
     )
     optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
 
-    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
-    axes = figure.subplots(2, 4)
+    # %% Four sensors with rings of 192 sites, which differ in the fovea, and their pictures of the centre.
+    figure = Figure(figsize=(8.0, 8.4), layout="constrained")
     uncovered_um2, sizes_um = {}, {}
-    for k, (fovea, name) in enumerate(FOVEAS.items()):
-        # %% One sensor: rings of 192 sites, and its fovea.
+    x_um, y_um = np.meshgrid(CENTRE.x_um, CENTRE.y_um)
+    is_within = np.hypot(x_um, y_um) < 125.0
+    for axes, (fovea, name) in zip(figure.subplots(2, 2).ravel(), FOVEAS.items(), strict=True):
         layout = fs.layout.log_polar(
             n_sectors=192, min_size_um=MIN_SIZE_UM, r_max_um=175.0, fovea=fovea, stagger=True, chords_per_arc=2
         )
@@ -54,29 +53,17 @@ def main(out_dir: Path) -> None:
             layout, qe=fs.SiliconQE(depth_um=3.0), capacitance_f=4e-16 * layout.area_um2, read_noise_e=2.0, bits=10
         )
         capture = fs.Camera(optics=optics, sensor=sensor).capture(scene, exposure_s=1 / 30, seed=1)
-
-        # %% Its picture of the centre, and its layout there.
         picture = capture.picture(grid=CENTRE)
         image = picture.to_image(capture.white_dn)
         x_min, y_min, x_max, y_max = CENTRE.bounds_um
-        axes[0, k].set_facecolor("#b9c4d6")
-        axes[0, k].imshow(
-            np.dstack((image[..., :1],) * 3 + (image[..., 1:],)), extent=(x_min, x_max, y_min, y_max), origin="upper"
-        )
-        axes[0, k].set_title(f"{name}:\n{layout.n_sites:,} photosites", fontsize=10)
-        inner = fs.layout.clip(layout, shapely.box(*INNER_BOUNDS_UM), cut="drop")
-        inner.plot(ax=axes[1, k], scale_bar=False)
-        axes[1, k].set(xlim=INNER_BOUNDS_UM[::2], ylim=INNER_BOUNDS_UM[1::2], ylabel="")
-        if k == 0:
-            axes[0, k].set_ylabel("y / µm")
-            axes[1, k].set_ylabel("y / µm")
-
-        # %% Area without data.
-        x_um, y_um = np.meshgrid(CENTRE.x_um, CENTRE.y_um)
-        is_within = np.hypot(x_um, y_um) < 125.0
+        axes.set_facecolor("#b9c4d6")
+        grey = np.dstack((image[..., :1],) * 3 + (image[..., 1:],))
+        axes.imshow(grey, extent=(x_min, x_max, y_min, y_max), origin="upper")
+        axes.set_title(f"{name}: {layout.n_sites:,} photosites")
+        axes.set(xlabel="x / µm", ylabel="y / µm")
         uncovered_um2[fovea] = float((1.0 - picture.coverage[is_within]).sum()) * CENTRE.cell_area_um2
         sizes_um[fovea] = float(np.sqrt(layout.area_um2.min()))
-    save_figure(figure, out_dir / "17_blind_spot_cures.png", dpi=140)
+    save_figure(figure, out_dir / "17_filling_the_blind_spot.png", dpi=140)
 
     # %% Checks.
     for fovea, area_um2 in uncovered_um2.items():

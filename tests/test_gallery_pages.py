@@ -1,0 +1,59 @@
+"""Pages of the gallery: each script in steps, with its question, its figures and all of its code."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+import foveasim
+
+REPOSITORY = Path(foveasim.__file__).parents[1]
+SCRIPTS = sorted((REPOSITORY / "gallery").glob("*.py"))
+
+
+@pytest.fixture
+def pages(monkeypatch):
+    monkeypatch.syspath_prepend(str(REPOSITORY / "docs"))
+    import gallery_pages
+
+    yield gallery_pages
+    sys.modules.pop("gallery_pages", None)
+
+
+def code_lines(text):
+    """Return lines without indentation, comments that are text of steps, and blank ones."""
+    return [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("# ")]
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_pages_contain_each_line_of_scripts(pages, path):
+    lines = set(code_lines(pages.page_of(path, "Title", [])))
+    script = path.read_text().split('"""\n\n', 1)[1].split('if __name__ == "__main__":')[0]
+    script = re.sub(r"^def main\(.*?\) -> None:$", "", script, flags=re.DOTALL | re.MULTILINE)
+    missing = [line for line in code_lines(script) if line not in lines]
+
+    # The docstring of `main`, and the folder of the figures, are not on the page.
+    assert [line for line in missing if not line.startswith(("out_dir.mkdir(", '"""'))] == []
+    assert len(pages.read_script(path).steps) >= 2
+
+
+def test_page_shows_figures_after_their_steps(pages, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        '"""\nHow many?\n\nNew here: ``one``.\n\nExpect: two lines\nof text.\n"""\n\nN = 1\n\n\n'
+        'def double(n):\n    """Return twice a number."""\n    return 2 * n\n\n\n'
+        'def main(out_dir):\n    """Write."""\n    # %% First step,\n    # continued.\n    save(out_dir / "a.png")\n'
+        '    # %% Second step.\n    save(out_dir / "b.png")\n\n\nif __name__ == "__main__":\n    main(1)\n'
+    )
+
+    page = pages.page_of(script, "Title", ["s/a.png", "s/b.png", "s/c.png"])
+
+    order = ["# Title", "How many?", "](s/a.png)", "Two lines of text.", "`one`", "N = 1", "`double`: Return twice", "First step, "
+             "continued.", 'save(out_dir / "a.png")', "Second step.", 'save(out_dir / "b.png")', "](s/b.png)", "](s/c.png)"]  # fmt: skip
+    at = [page.index(part) for part in order]
+    assert at == sorted(at)
+    assert page.count("s/a.png") == 1
+    assert "__main__" not in page
