@@ -73,9 +73,16 @@ MODULES = {
 GROUPS = {
     "foveasim.layout": {
         "Generators": ("foveasim.layout.generators", "foveasim.layout.diagrams"),
-        "Edits": ("foveasim.layout.edits", "foveasim.layout.channels", "foveasim.layout.gaps"),
+        "Edits": (
+            "foveasim.layout.edits",
+            "foveasim.layout.channels",
+            "foveasim.layout.gaps",
+        ),
         "Design rules": ("foveasim.layout.drc",),
-        "Neighbours and readout": ("foveasim.layout.adjacency", "foveasim.layout.readout"),
+        "Neighbours and readout": (
+            "foveasim.layout.adjacency",
+            "foveasim.layout.readout",
+        ),
         "Files": ("foveasim.layout.files",),
     },
 }
@@ -113,7 +120,13 @@ def public_names() -> dict[str, list[str]]:
     public = {}
     for name, module in modules.items():
         # Names that a package imports from its subpackages are listed there.
-        hidden = {"__version__"}.union(*(other.__all__ for at, other in modules.items() if at.startswith(f"{name}.")))
+        hidden = {"__version__"}.union(
+            *(
+                other.__all__
+                for at, other in modules.items()
+                if at.startswith(f"{name}.")
+            )
+        )
         # Modules are not imported for this: foveasim.learn needs PyTorch.
         listed = dict.fromkeys([*module.__all__, *REGISTERED.get(name, {})])
         names = [n for n in listed if n not in hidden | parts[name]]
@@ -124,11 +137,21 @@ def public_names() -> dict[str, list[str]]:
 def main_names(public: dict[str, list[str]]) -> list[str]:
     """List the names of ``foveasim`` that have their page in another module, in the order of the data flow."""
     top = importlib.import_module("foveasim")
-    modules = {name: module for module, names in public.items() if module != "foveasim" for name in names}
+    modules = {
+        name: module
+        for module, names in public.items()
+        if module != "foveasim"
+        for name in names
+    }
     found = [f"{modules[name]}.{name}" for name in top.__all__ if name in modules]
     order = ["scene", "optics", "layout", "sensor", "reconstruct"]
     return sorted(
-        found, key=lambda name: (*(k for k, part in enumerate(order) if f".{part}." in name), len(order), name)
+        found,
+        key=lambda name: (
+            *(k for k, part in enumerate(order) if f".{part}." in name),
+            len(order),
+            name,
+        ),
     )
 
 
@@ -152,20 +175,30 @@ def generated_pages(repository: Path) -> set[Path]:
         for script in gallery_scripts(repository)
         for picture in re.findall(r'"(\w+\.(?:png|webp))"', script.read_text())
     }
-    layouts = {Path("layouts", page) for page in ("index.md", *(f"{name}.png" for name in bundled_layouts()))}
+    layouts = {
+        Path("layouts", page)
+        for page in ("index.md", *(f"{name}.png" for name in bundled_layouts()))
+    }
     reference = {Path("reference", page) for page in {"index.md"} | modules | made}
-    return layouts | reference | {Path("gallery", page) for page in {"index.md"} | scripts}
+    return (
+        layouts | reference | {Path("gallery", page) for page in {"index.md"} | scripts}
+    )
 
 
 def tables_of(name: str, names: list[str]) -> dict[str, Mapping[Any, Any]]:
     """Return the registries and other mappings among the public names of a module."""
     module = importlib.import_module(name)
-    return {n: getattr(module, n) for n in names if isinstance(getattr(module, n), Mapping)}
+    return {
+        n: getattr(module, n) for n in names if isinstance(getattr(module, n), Mapping)
+    }
 
 
 def entry_of(value: object) -> str:
     """Return one line about an object in a mapping."""
-    parts = [getattr(value, attribute, "") for attribute in ("title", "description", "definition")]
+    parts = [
+        getattr(value, attribute, "")
+        for attribute in ("title", "description", "definition")
+    ]
     texts = [part for part in parts if isinstance(part, str) and part]
     if not texts and (inspect.isroutine(value) or inspect.isclass(value)):
         texts = [(inspect.getdoc(value) or "").partition("\n\n")[0]]
@@ -176,13 +209,20 @@ def entry_of(value: object) -> str:
 
 def plain_roles(text: str) -> str:
     """Return reStructuredText of one paragraph as Markdown."""
-    return re.sub(r":\w+:`~?([^`]*)`", r"`\1`", text).replace("``", "`").replace("\n", " ").strip()
+    return (
+        re.sub(r":\w+:`~?([^`]*)`", r"`\1`", text)
+        .replace("``", "`")
+        .replace("\n", " ")
+        .strip()
+    )
 
 
 def comment_on(name: str, module: str) -> str:
     """Return the comment before the definition of a constant of a module, from the module that defines it."""
     for path in sorted((REPOSITORY / module.replace(".", "/")).rglob("*.py")):
-        found = re.search(rf"((?:^#: .*\n)+){name}(?:: .*)? = ", path.read_text(), re.MULTILINE)
+        found = re.search(
+            rf"((?:^#: .*\n)+){name}(?:: .*)? = ", path.read_text(), re.MULTILINE
+        )
         if found:
             return plain_roles(re.sub(r"^#: ", "", found[1], flags=re.MULTILINE))
     return ""
@@ -195,7 +235,9 @@ def sections_of(name: str, names: list[str]) -> Iterator[tuple[str, list[str]]]:
     heading_of = {}
     for n in names:
         home = getattr(getattr(module, n), "__module__", "") or ""
-        heading_of[n] = next((heading for heading, homes in groups.items() if home.startswith(homes)), "")
+        heading_of[n] = next(
+            (heading for heading, homes in groups.items() if home.startswith(homes)), ""
+        )
     for heading in ("", *groups):
         yield heading, [n for n in names if heading_of[n] == heading]
 
@@ -210,8 +252,12 @@ def write_reference(_app: Sphinx, _config: Config) -> None:
         page = [f"# {name}", about]
         if name == "foveasim":
             main = "\n".join(f"   ~{full_name}" for full_name in main_names(public))
-            page.append(f"```{{eval-rst}}\n.. autosummary::\n   :nosignatures:\n\n{main}\n```")
-        for heading, names in sections_of(name, [n for n in public[name] if n not in tables]):
+            page.append(
+                f"```{{eval-rst}}\n.. autosummary::\n   :nosignatures:\n\n{main}\n```"
+            )
+        for heading, names in sections_of(
+            name, [n for n in public[name] if n not in tables]
+        ):
             rows = "\n".join(f"   {n}" for n in names)
             page.append(f"## {heading}" * bool(heading))
             page.append(
@@ -220,11 +266,18 @@ def write_reference(_app: Sphinx, _config: Config) -> None:
             )
         for n, table in tables.items():
             kind = f"Registry: {table.kind}. " if isinstance(table, Registry) else ""
-            rows = "\n".join(f"| `{key}` | {entry_of(value)} |" for key, value in table.items())
-            page.append(f"## {n}\n\n{kind}{comment_on(n, name)}\n\n| key | |\n|---|---|\n{rows}")
+            rows = "\n".join(
+                f"| `{key}` | {entry_of(value)} |" for key, value in table.items()
+            )
+            page.append(
+                f"## {n}\n\n{kind}{comment_on(n, name)}\n\n| key | |\n|---|---|\n{rows}"
+            )
         (REFERENCE / f"{name}.md").write_text("\n\n".join(filter(None, page)) + "\n")
     contents = "\n".join(MODULES)
-    rows = "\n".join(f"| [{name}]({name}.md) | {about} | {len(public[name])} |" for name, about in MODULES.items())
+    rows = "\n".join(
+        f"| [{name}]({name}.md) | {about} | {len(public[name])} |"
+        for name, about in MODULES.items()
+    )
     table = f"| module | contents | public names |\n|---|---|---|\n{rows}"
     page_text = f"# Reference\n\n{table}\n\n```{{toctree}}\n:hidden:\n:maxdepth: 1\n\n{contents}\n```\n"
     (REFERENCE / "index.md").write_text(page_text)
@@ -245,15 +298,21 @@ def write_layouts(_app: Sphinx, _config: Config) -> None:
         source = " ".join(path.read_text().partition("source: >")[2].split())
         found = layout.describe()
         x0, y0, x1, y1 = found.bounds_um
-        sizes = format_quantity([float(found.size_um[0]), float(found.size_um[-1])], "µm", digits=3)
+        sizes = format_quantity(
+            [float(found.size_um[0]), float(found.size_um[-1])], "µm", digits=3
+        )
         figures = f"{found.n_sites:,} photosites of {sizes} in a field of {x1 - x0:,.5g} × {y1 - y0:,.5g} µm."
         title = first_comment(path)
-        sections.append(f"## {name}\n\n{title} {figures}\n\n![{title}]({name}.png)\n\nSource: {source}")
+        sections.append(
+            f"## {name}\n\n{title} {figures}\n\n![{title}]({name}.png)\n\nSource: {source}"
+        )
     about = (
         "Each name stands for a layout in every command, and in `fs.read_layout`: `foveasim view giotto_2`. The files are in "
         "`layouts/`, with design rules that they satisfy."
     )
-    (BUNDLED / "index.md").write_text("\n\n".join(["# Bundled layouts", about, *sections]) + "\n")
+    (BUNDLED / "index.md").write_text(
+        "\n\n".join(["# Bundled layouts", about, *sections]) + "\n"
+    )
 
 
 def figure_of(layout: Layout) -> Figure:
@@ -263,7 +322,13 @@ def figure_of(layout: Layout) -> Figure:
     x0, y0, x1, y1 = layout.bounds_um
     centre_um = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
     has_channels = layout.channel.max() > 0
-    by = "channel" if has_channels else "size_um" if np.ptp(layout.size_um) > SAME_SIZE_UM else None
+    by = (
+        "channel"
+        if has_channels
+        else "size_um"
+        if np.ptp(layout.size_um) > SAME_SIZE_UM
+        else None
+    )
     layout.plot(by, ax=whole, legend=not has_channels)
     offset_um = layout.centroid_um - centre_um
     radius_um = np.hypot(*offset_um.T)
@@ -274,7 +339,9 @@ def figure_of(layout: Layout) -> Figure:
     distance_um = np.hypot(*(layout.centroid_um - centre_um).T)
     near = min(N_NEAR, layout.n_sites - 1)
     reach_um = np.partition(distance_um, near)[near]
-    layout[distance_um < 2.0 * reach_um].plot("channel" if has_channels else None, ax=part, legend=False)
+    layout[distance_um < 2.0 * reach_um].plot(
+        "channel" if has_channels else None, ax=part, legend=False
+    )
     part.set_xlim(centre_um[0] - reach_um, centre_um[0] + reach_um)
     part.set_ylim(centre_um[1] - reach_um, centre_um[1] + reach_um)
     return figure
@@ -287,7 +354,9 @@ def write_thumbnail(picture: Path, thumbnail: Path) -> None:
     n_y = min(image.height, round(TALLEST * image.width))
     white = Image.new("RGBA", (image.width, n_y), "white")
     white.alpha_composite(image.crop((0, 0, image.width, n_y)))
-    ImageOps.pad(white.convert("RGB"), THUMBNAIL_PX, color="white").save(thumbnail, quality=88)
+    ImageOps.pad(white.convert("RGB"), THUMBNAIL_PX, color="white").save(
+        thumbnail, quality=88
+    )
 
 
 def write_gallery(_app: Sphinx, _config: Config) -> None:
@@ -299,13 +368,17 @@ def write_gallery(_app: Sphinx, _config: Config) -> None:
         folder = GALLERY / script.stem
         done = folder / "done"
         is_skipped = "import torch" in script.read_text() and not find_spec("torch")
-        if not is_skipped and (not done.exists() or done.stat().st_mtime < script.stat().st_mtime):
+        if not is_skipped and (
+            not done.exists() or done.stat().st_mtime < script.stat().st_mtime
+        ):
             folder.mkdir(parents=True, exist_ok=True)
             with with_dark_variants():
                 runpy.run_path(str(script))["main"](folder)
             done.touch()
         title = script.stem[3:].replace("_", " ").capitalize()
-        description = (ast.get_docstring(ast.parse(script.read_text())) or "").replace("``", "`")
+        description = (ast.get_docstring(ast.parse(script.read_text())) or "").replace(
+            "``", "`"
+        )
         pictures = [
             f"{script.stem}/{picture.name}"
             for picture in sorted(folder.glob("*.*"))
@@ -313,29 +386,47 @@ def write_gallery(_app: Sphinx, _config: Config) -> None:
         ]
         if is_skipped and not pictures:
             kept = sorted(PICTURES.glob(f"{script.stem[:2]}_*.png"))
-            pictures = [f"../pictures/{picture.name}" for picture in kept if not picture.stem.endswith(SUFFIX)]
+            pictures = [
+                f"../pictures/{picture.name}"
+                for picture in kept
+                if not picture.stem.endswith(SUFFIX)
+            ]
             folder.mkdir(parents=True, exist_ok=True)
             description += f"\n\n{WITHOUT_TORCH}"
         shown = "\n\n".join(f"![{picture}]({picture})" for picture in pictures)
-        source = (
-            f"```{{literalinclude}} ../../gallery/{script.name}\n:language: python\n:start-at: from __future__\n```"
-        )
+        source = f"```{{literalinclude}} ../../gallery/{script.name}\n:language: python\n:start-at: from __future__\n```"
         text = f"# {title}\n\n{description}\n\n{shown}\n\n## gallery/{script.name}\n\n{source}\n"
         (GALLERY / f"{script.stem}.md").write_text(text)
         question = description.partition("\n")[0]
         if pictures:
             write_thumbnail(GALLERY / pictures[0], folder / "thumbnail.jpg")
-        thumbnail = f":img-top: {script.stem}/thumbnail.jpg\n:img-alt: {title}\n" if pictures else ""
+        thumbnail = (
+            f":img-top: {script.stem}/thumbnail.jpg\n:img-alt: {title}\n"
+            if pictures
+            else ""
+        )
         cards[int(script.stem[:2])] = (
             f":::{{grid-item-card}} {title}\n:link: {script.stem}\n:link-type: doc\n{thumbnail}\n{question}\n:::"
         )
     about = "Each script generates its pictures when the site is built, and checks its figures."
     listed = {number for numbers in CHAPTERS.values() for number in numbers}
-    chapters = {**CHAPTERS, "More": tuple(number for number in cards if number not in listed)}
-    stems = {int(script.stem[:2]): script.stem for script in gallery_scripts(REPOSITORY)}
-    contents = "\n".join(stems[number] for numbers in chapters.values() for number in numbers)
+    chapters = {
+        **CHAPTERS,
+        "More": tuple(number for number in cards if number not in listed),
+    }
+    stems = {
+        int(script.stem[:2]): script.stem for script in gallery_scripts(REPOSITORY)
+    }
+    contents = "\n".join(
+        stems[number] for numbers in chapters.values() for number in numbers
+    )
     page = [f"# Gallery\n\n{about}\n\n```{{toctree}}\n:hidden:\n\n{contents}\n```"]
     for chapter, numbers in chapters.items():
         if numbers:
-            page += [f"## {chapter}", "::::{grid} 1 2 3 3\n:gutter: 3", *(cards[number] for number in numbers), "::::"]
+            page += [
+                f"## {chapter}",
+                "::::{grid} 1 2 3 3\n:gutter: 3",
+                *(cards[number] for number in numbers),
+                "::::",
+            ]
     (GALLERY / "index.md").write_text("\n\n".join(page) + "\n")

@@ -1,11 +1,13 @@
 """
 How large is the blind spot of a log-polar sensor, and which foveas remove it?
 
-New here: ``log_polar(fovea=)`` in a capture, ``Picture.coverage`` for regions without photosites.
+New here: ``log_polar(fovea=)`` in a capture, ``Picture.coverage`` for regions without
+photosites.
 
-Expect: the same photograph through four sensors that differ only in the centre. Without a fovea, a disc with a radius of
-60.12 µm has no data (11,355 µm² within 0.5 %, since its boundary consists of chords). Hexagons, rings and linear rings cover
-it, and no pixel is smaller than the minimum size of 2 µm.
+Expect: the same photograph through four sensors that differ only in the centre. Without
+a fovea, a disc with a radius of 60.12 µm has no data (11,355 µm² within 0.5 %, since
+its boundary consists of chords). Hexagons, rings and linear rings cover it, and no
+pixel is smaller than the minimum size of 2 µm.
 """
 
 from __future__ import annotations
@@ -26,7 +28,12 @@ MIN_SIZE_UM = 2.0
 #: Grid of the centre, with pixels of 0.5 µm.
 CENTRE = fs.Grid((520, 520), 0.5, (-130.0, -130.0))
 INNER_BOUNDS_UM = (-10.0, -10.0, 72.0, 72.0)
-FOVEAS = {"none": "blind spot", "hexagons": "hexagons", "rings": "rings", "linear": "linear rings"}
+FOVEAS = {
+    "none": "blind spot",
+    "hexagons": "hexagons",
+    "rings": "rings",
+    "linear": "linear rings",
+}
 
 
 def main(out_dir: Path) -> None:
@@ -48,12 +55,23 @@ def main(out_dir: Path) -> None:
     for k, (fovea, name) in enumerate(FOVEAS.items()):
         # %% One sensor: rings of 192 sites, and its fovea.
         layout = fs.layout.log_polar(
-            n_sectors=192, min_size_um=MIN_SIZE_UM, r_max_um=175.0, fovea=fovea, stagger=True, chords_per_arc=2
+            n_sectors=192,
+            min_size_um=MIN_SIZE_UM,
+            r_max_um=175.0,
+            fovea=fovea,
+            stagger=True,
+            chords_per_arc=2,
         )
         sensor = fs.Sensor(
-            layout, qe=fs.SiliconQE(depth_um=3.0), capacitance_f=4e-16 * layout.area_um2, read_noise_e=2.0, bits=10
+            layout,
+            qe=fs.SiliconQE(depth_um=3.0),
+            capacitance_f=4e-16 * layout.area_um2,
+            read_noise_e=2.0,
+            bits=10,
         )
-        capture = fs.Camera(optics=optics, sensor=sensor).capture(scene, exposure_s=1 / 30, seed=1)
+        capture = fs.Camera(optics=optics, sensor=sensor).capture(
+            scene, exposure_s=1 / 30, seed=1
+        )
 
         # %% Its picture of the centre, and its layout there.
         picture = capture.picture(grid=CENTRE)
@@ -61,7 +79,9 @@ def main(out_dir: Path) -> None:
         x_min, y_min, x_max, y_max = CENTRE.bounds_um
         axes[0, k].set_facecolor("#b9c4d6")
         axes[0, k].imshow(
-            np.dstack((image[..., :1],) * 3 + (image[..., 1:],)), extent=(x_min, x_max, y_min, y_max), origin="upper"
+            np.dstack((image[..., :1],) * 3 + (image[..., 1:],)),
+            extent=(x_min, x_max, y_min, y_max),
+            origin="upper",
         )
         axes[0, k].set_title(f"{name}:\n{layout.n_sites:,} photosites", fontsize=10)
         inner = fs.layout.clip(layout, shapely.box(*INNER_BOUNDS_UM), cut="drop")
@@ -74,16 +94,23 @@ def main(out_dir: Path) -> None:
         # %% Area without data.
         x_um, y_um = np.meshgrid(CENTRE.x_um, CENTRE.y_um)
         is_within = np.hypot(x_um, y_um) < 125.0
-        uncovered_um2[fovea] = float((1.0 - picture.coverage[is_within]).sum()) * CENTRE.cell_area_um2
+        uncovered_um2[fovea] = (
+            float((1.0 - picture.coverage[is_within]).sum()) * CENTRE.cell_area_um2
+        )
         sizes_um[fovea] = float(np.sqrt(layout.area_um2.min()))
     save_figure(figure, out_dir / "17_blind_spot_cures.png", dpi=140)
 
     # %% Checks.
     for fovea, area_um2 in uncovered_um2.items():
-        print(f"{FOVEAS[fovea]}: {area_um2:.0f} µm² without data, smallest pixel {sizes_um[fovea]:.2f} µm")
+        print(
+            f"{FOVEAS[fovea]}: {area_um2:.0f} µm² without data, smallest pixel "
+            f"{sizes_um[fovea]:.2f} µm"
+        )
     spot_um2 = math.pi * 60.12**2
     assert abs(uncovered_um2["none"] / spot_um2 - 1.0) < 0.005
-    assert all(uncovered_um2[fovea] < 1e-3 * spot_um2 for fovea in FOVEAS if fovea != "none")
+    assert all(
+        uncovered_um2[fovea] < 1e-3 * spot_um2 for fovea in FOVEAS if fovea != "none"
+    )
     assert min(sizes_um.values()) > 0.99 * MIN_SIZE_UM
 
 
