@@ -49,7 +49,9 @@ nb_execution_mode = "cache"
 nb_execution_in_temp = True
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
-nb_execution_excludepatterns = [] if find_spec("torch") else ["notebooks/dataset_in_pytorch.ipynb"]
+nb_execution_excludepatterns = (
+    [] if find_spec("torch") else ["notebooks/dataset_in_pytorch.ipynb"]
+)
 autosummary_generate = True
 autodoc_typehints = "none"  # numpydoc's parameter lists contain types, shapes and units
 numpydoc_show_class_members = False
@@ -61,7 +63,9 @@ nitpicky = False
 class DarkVariants(SphinxTransform):
     """Show the variants of the figures of a page where the page is dark."""
 
-    default_priority = 700  # after the parser, before Sphinx collects the files of images
+    default_priority = (
+        700  # after the parser, before Sphinx collects the files of images
+    )
 
     def apply(self) -> None:
         """Add the variants that exist to a page."""
@@ -79,6 +83,10 @@ class DarkVariants(SphinxTransform):
 def setup(app: Sphinx) -> None:
     """Register the generators of pages; called by Sphinx."""
     # Before Sphinx lists the pages.
-    for write in (generated_pages.write_reference, generated_pages.write_layouts, generated_pages.write_gallery):
+    for write in (
+        generated_pages.write_reference,
+        generated_pages.write_layouts,
+        generated_pages.write_gallery,
+    ):
         app.connect("config-inited", write)
     app.add_transform(DarkVariants)

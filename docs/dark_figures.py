@@ -60,8 +60,15 @@ def invert_greys(figure: Figure) -> list[tuple[Any, Any]]:
     for artist in _artists(figure):
         found = []  # before colours are set: those of markers follow the colour of their line
         for name in PROPERTIES:
-            get, set_value = getattr(artist, f"get_{name}", None), getattr(artist, f"set_{name}", None)
-            if get is None or set_value is None or (isinstance(artist, Collection) and name == "color"):
+            get, set_value = (
+                getattr(artist, f"get_{name}", None),
+                getattr(artist, f"set_{name}", None),
+            )
+            if (
+                get is None
+                or set_value is None
+                or (isinstance(artist, Collection) and name == "color")
+            ):
                 continue
             value = get()
             inverted = _inverted(value)
@@ -88,7 +95,11 @@ def _inverted(value: Any) -> Any:
     """Return an inverted grey, or an array of at most ``MAX_COLOURS`` of them; None for other values."""
     if isinstance(value, np.ndarray) and value.ndim == 2:
         colours = [_inverted(colour) for colour in value]
-        return None if not colours or len(colours) > MAX_COLOURS or None in colours else colours
+        return (
+            None
+            if not colours or len(colours) > MAX_COLOURS or None in colours
+            else colours
+        )
     try:
         red, green, blue, alpha = to_rgba(value)
     except (TypeError, ValueError):  # "auto", "none"

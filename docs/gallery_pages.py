@@ -56,7 +56,10 @@ def read_script(path: Path) -> Script:
     """Read the parts of a script: those of its docstring, its definitions, and the steps of ``main``."""
     source = path.read_text()
     module = ast.parse(source)
-    paragraphs = [" ".join(each.split()) for each in (ast.get_docstring(module) or "").replace("``", "`").split("\n\n")]
+    paragraphs = [
+        " ".join(each.split())
+        for each in (ast.get_docstring(module) or "").replace("``", "`").split("\n\n")
+    ]
     labelled = dict(each.split(": ", 1) for each in paragraphs[1:] if ": " in each)
     lines = source.splitlines()
     setup: list[str] = []
@@ -64,16 +67,30 @@ def read_script(path: Path) -> Script:
     steps: list[Step] = []
     end = 0
     for node in module.body:
-        first = min([node.lineno, *(each.lineno for each in getattr(node, "decorator_list", []))]) - 1
+        first = (
+            min(
+                [
+                    node.lineno,
+                    *(each.lineno for each in getattr(node, "decorator_list", [])),
+                ]
+            )
+            - 1
+        )
         between, end = lines[end:first], node.end_lineno or first
         own = lines[first:end]
         if (isinstance(node, ast.Expr) and node is module.body[0]) or _runs_main(node):
             continue
         if isinstance(node, ast.FunctionDef) and node.name == MAIN:
-            begin = node.body[0].end_lineno if ast.get_docstring(node) else node.body[0].lineno - 1
+            begin = (
+                node.body[0].end_lineno
+                if ast.get_docstring(node)
+                else node.body[0].lineno - 1
+            )
             steps = _steps(lines[begin:end])
         elif isinstance(node, ast.FunctionDef | ast.ClassDef):
-            definitions.append(Step((ast.get_docstring(node) or "").partition("\n")[0], own, node.name))
+            definitions.append(
+                Step((ast.get_docstring(node) or "").partition("\n")[0], own, node.name)
+            )
         else:
             setup += [*between, *own]
     return Script(
@@ -108,14 +125,21 @@ def page_of(path: Path, title: str, pictures: list[str], note: str = "") -> str:
         first = left.pop(0)
         parts.append(_shown(first, script.question))
     if script.expect:
-        parts.append(f"**What it shows.** {script.expect[0].upper()}{script.expect[1:]}")
+        parts.append(
+            f"**What it shows.** {script.expect[0].upper()}{script.expect[1:]}"
+        )
     if script.new:
         parts.append(f"**Used here:** {script.new}")
-    parts += ["## Code", f"Complete script: {{download}}`{path.name} <../../gallery/{path.name}>`."]
+    parts += [
+        "## Code",
+        f"Complete script: {{download}}`{path.name} <../../gallery/{path.name}>`.",
+    ]
     if script.setup:
         parts += ["Imports and settings:", _code(script.setup)]
     for definition in script.definitions:
-        parts.append(f":::{{dropdown}} `{definition.name}`: {definition.text}\n{_code(definition.code)}\n:::")
+        parts.append(
+            f":::{{dropdown}} `{definition.name}`: {definition.text}\n{_code(definition.code)}\n:::"
+        )
     for step in script.steps:
         parts += [step.text, _code(step.code)]
         names = re.findall(r"[\"']([\w.-]+\.(?:png|webp))[\"']", step.code)
@@ -144,7 +168,9 @@ def _steps(lines: list[str]) -> list[Step]:
         else:
             steps[-1].lines.append(line)
         is_text = bool(begins)
-    only_folder = steps[0].code.startswith("out_dir.mkdir") and "\n" not in steps[0].code
+    only_folder = (
+        steps[0].code.startswith("out_dir.mkdir") and "\n" not in steps[0].code
+    )
     return steps[1:] if only_folder or not steps[0].code else steps
 
 

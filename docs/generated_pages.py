@@ -80,9 +80,16 @@ MODULES = {
 GROUPS = {
     "foveasim.layout": {
         "Generators": ("foveasim.layout.generators", "foveasim.layout.diagrams"),
-        "Edits": ("foveasim.layout.edits", "foveasim.layout.channels", "foveasim.layout.gaps"),
+        "Edits": (
+            "foveasim.layout.edits",
+            "foveasim.layout.channels",
+            "foveasim.layout.gaps",
+        ),
         "Design rules": ("foveasim.layout.drc",),
-        "Neighbours and readout": ("foveasim.layout.adjacency", "foveasim.layout.readout"),
+        "Neighbours and readout": (
+            "foveasim.layout.adjacency",
+            "foveasim.layout.readout",
+        ),
         "Files": ("foveasim.layout.files",),
     },
 }
@@ -122,7 +129,13 @@ def public_names() -> dict[str, list[str]]:
     public = {}
     for name, module in modules.items():
         # Names that a package imports from its subpackages are listed there.
-        hidden = {"__version__"}.union(*(other.__all__ for at, other in modules.items() if at.startswith(f"{name}.")))
+        hidden = {"__version__"}.union(
+            *(
+                other.__all__
+                for at, other in modules.items()
+                if at.startswith(f"{name}.")
+            )
+        )
         # Modules are not imported for this: foveasim.learn needs PyTorch.
         listed = dict.fromkeys([*module.__all__, *REGISTERED.get(name, {})])
         names = [n for n in listed if n not in hidden | parts[name]]
@@ -133,11 +146,21 @@ def public_names() -> dict[str, list[str]]:
 def main_names(public: dict[str, list[str]]) -> list[str]:
     """List the names of ``foveasim`` that have their page in another module, in the order of the data flow."""
     top = importlib.import_module("foveasim")
-    modules = {name: module for module, names in public.items() if module != "foveasim" for name in names}
+    modules = {
+        name: module
+        for module, names in public.items()
+        if module != "foveasim"
+        for name in names
+    }
     found = [f"{modules[name]}.{name}" for name in top.__all__ if name in modules]
     order = ["scene", "optics", "layout", "sensor", "reconstruct"]
     return sorted(
-        found, key=lambda name: (*(k for k, part in enumerate(order) if f".{part}." in name), len(order), name)
+        found,
+        key=lambda name: (
+            *(k for k, part in enumerate(order) if f".{part}." in name),
+            len(order),
+            name,
+        ),
     )
 
 
@@ -161,20 +184,30 @@ def generated_pages(repository: Path) -> set[Path]:
         for script in gallery_scripts(repository)
         for picture in re.findall(r'"(\w+\.(?:png|webp))"', script.read_text())
     }
-    layouts = {Path("layouts", page) for page in ("index.md", *(f"{name}.png" for name in bundled_layouts()))}
+    layouts = {
+        Path("layouts", page)
+        for page in ("index.md", *(f"{name}.png" for name in bundled_layouts()))
+    }
     reference = {Path("reference", page) for page in {"index.md"} | modules | made}
-    return layouts | reference | {Path("gallery", page) for page in {"index.md"} | scripts}
+    return (
+        layouts | reference | {Path("gallery", page) for page in {"index.md"} | scripts}
+    )
 
 
 def tables_of(name: str, names: list[str]) -> dict[str, Mapping[Any, Any]]:
     """Return the registries and other mappings among the public names of a module."""
     module = importlib.import_module(name)
-    return {n: getattr(module, n) for n in names if isinstance(getattr(module, n), Mapping)}
+    return {
+        n: getattr(module, n) for n in names if isinstance(getattr(module, n), Mapping)
+    }
 
 
 def entry_of(value: object) -> str:
     """Return one line about an object in a mapping."""
-    parts = [getattr(value, attribute, "") for attribute in ("title", "description", "definition")]
+    parts = [
+        getattr(value, attribute, "")
+        for attribute in ("title", "description", "definition")
+    ]
     texts = [part for part in parts if isinstance(part, str) and part]
     if not texts and (inspect.isroutine(value) or inspect.isclass(value)):
         texts = [(inspect.getdoc(value) or "").partition("\n\n")[0]]
@@ -185,13 +218,20 @@ def entry_of(value: object) -> str:
 
 def plain_roles(text: str) -> str:
     """Return reStructuredText of one paragraph as Markdown."""
-    return re.sub(r":\w+:`~?([^`]*)`", r"`\1`", text).replace("``", "`").replace("\n", " ").strip()
+    return (
+        re.sub(r":\w+:`~?([^`]*)`", r"`\1`", text)
+        .replace("``", "`")
+        .replace("\n", " ")
+        .strip()
+    )
 
 
 def comment_on(name: str, module: str) -> str:
     """Return the comment before the definition of a constant of a module, from the module that defines it."""
     for path in sorted((REPOSITORY / module.replace(".", "/")).rglob("*.py")):
-        found = re.search(rf"((?:^#: .*\n)+){name}(?:: .*)? = ", path.read_text(), re.MULTILINE)
+        found = re.search(
+            rf"((?:^#: .*\n)+){name}(?:: .*)? = ", path.read_text(), re.MULTILINE
+        )
         if found:
             return plain_roles(re.sub(r"^#: ", "", found[1], flags=re.MULTILINE))
     return ""
@@ -204,7 +244,9 @@ def sections_of(name: str, names: list[str]) -> Iterator[tuple[str, list[str]]]:
     heading_of = {}
     for n in names:
         home = getattr(getattr(module, n), "__module__", "") or ""
-        heading_of[n] = next((heading for heading, homes in groups.items() if home.startswith(homes)), "")
+        heading_of[n] = next(
+            (heading for heading, homes in groups.items() if home.startswith(homes)), ""
+        )
     for heading in ("", *groups):
         yield heading, [n for n in names if heading_of[n] == heading]
 
@@ -219,8 +261,12 @@ def write_reference(_app: Sphinx, _config: Config) -> None:
         page = [f"# {name}", about]
         if name == "foveasim":
             main = "\n".join(f"   ~{full_name}" for full_name in main_names(public))
-            page.append(f"```{{eval-rst}}\n.. autosummary::\n   :nosignatures:\n\n{main}\n```")
-        for heading, names in sections_of(name, [n for n in public[name] if n not in tables]):
+            page.append(
+                f"```{{eval-rst}}\n.. autosummary::\n   :nosignatures:\n\n{main}\n```"
+            )
+        for heading, names in sections_of(
+            name, [n for n in public[name] if n not in tables]
+        ):
             rows = "\n".join(f"   {n}" for n in names)
             page.append(f"## {heading}" * bool(heading))
             page.append(
@@ -229,11 +275,18 @@ def write_reference(_app: Sphinx, _config: Config) -> None:
             )
         for n, table in tables.items():
             kind = f"Registry: {table.kind}. " if isinstance(table, Registry) else ""
-            rows = "\n".join(f"| `{key}` | {entry_of(value)} |" for key, value in table.items())
-            page.append(f"## {n}\n\n{kind}{comment_on(n, name)}\n\n| key | |\n|---|---|\n{rows}")
+            rows = "\n".join(
+                f"| `{key}` | {entry_of(value)} |" for key, value in table.items()
+            )
+            page.append(
+                f"## {n}\n\n{kind}{comment_on(n, name)}\n\n| key | |\n|---|---|\n{rows}"
+            )
         (REFERENCE / f"{name}.md").write_text("\n\n".join(filter(None, page)) + "\n")
     contents = "\n".join(MODULES)
-    rows = "\n".join(f"| [{name}]({name}.md) | {about} | {len(public[name])} |" for name, about in MODULES.items())
+    rows = "\n".join(
+        f"| [{name}]({name}.md) | {about} | {len(public[name])} |"
+        for name, about in MODULES.items()
+    )
     table = f"| module | contents | public names |\n|---|---|---|\n{rows}"
     page_text = f"# Reference\n\n{table}\n\n```{{toctree}}\n:hidden:\n:maxdepth: 1\n\n{contents}\n```\n"
     (REFERENCE / "index.md").write_text(page_text)
@@ -254,16 +307,22 @@ def write_layouts(_app: Sphinx, _config: Config) -> None:
         source = " ".join(path.read_text().partition("source: >")[2].split())
         found = layout.describe()
         x0, y0, x1, y1 = found.bounds_um
-        sizes = format_quantity([float(found.size_um[0]), float(found.size_um[-1])], "µm", digits=3)
+        sizes = format_quantity(
+            [float(found.size_um[0]), float(found.size_um[-1])], "µm", digits=3
+        )
         figures = f"{found.n_sites:,} photosites of {sizes} in a field of {x1 - x0:,.5g} × {y1 - y0:,.5g} µm."
         title = first_comment(path)
-        sections.append(f"## {name}\n\n{title} {figures}\n\n![{title}]({name}.png)\n\nSource: {source}")
+        sections.append(
+            f"## {name}\n\n{title} {figures}\n\n![{title}]({name}.png)\n\nSource: {source}"
+        )
     about = (
         "Each name stands for a layout in every command, and in `fs.read_layout`: `foveasim view giotto_2`. The files are in "
         "`layouts/`, with design rules that they satisfy. Colours of sizes have one scale for all layouts; the "
         "photograph is the mean irradiance of each photosite, without noise."
     )
-    (BUNDLED / "index.md").write_text("\n\n".join(["# Bundled layouts", about, *sections]) + "\n")
+    (BUNDLED / "index.md").write_text(
+        "\n\n".join(["# Bundled layouts", about, *sections]) + "\n"
+    )
 
 
 def figure_of(layout: Layout) -> Figure:
@@ -280,10 +339,17 @@ def figure_of(layout: Layout) -> Figure:
     bar.set_ticks([1, 10, 100], labels=["1", "10", "100"])
     side_um = max(x1 - x0, y1 - y0)
     face = rgb2gray(astronaut()[0:260, 95:355])[::-1]
-    power_map = PowerMap.from_array(face, pitch_um=side_um / face.shape[0], wavelength_nm=550.0)
+    power_map = PowerMap.from_array(
+        face, pitch_um=side_um / face.shape[0], wavelength_nm=550.0
+    )
     moved = layout.translate(*-centre_um)
     mean = Integrator(moved, power_map.grid)(power_map.data)[0] / layout.area_um2
-    plot_layout(layout, np.clip(mean, 0.0, 1.0)[:, np.newaxis].repeat(3, axis=1), ax=seen, scale_bar=False)
+    plot_layout(
+        layout,
+        np.clip(mean, 0.0, 1.0)[:, np.newaxis].repeat(3, axis=1),
+        ax=seen,
+        scale_bar=False,
+    )
     for axes in (sizes, seen):
         axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
     offset_um = layout.centroid_um - centre_um
@@ -302,12 +368,20 @@ def figure_of(layout: Layout) -> Figure:
         plot_layout(layout[is_near], size_colours[is_near], ax=part)
         rings = shapely.get_rings(layout[is_near].polygons())
         part.add_collection(
-            LineCollection([shapely.get_coordinates(ring) for ring in rings], colors="0.2", linewidths=0.6)
+            LineCollection(
+                [shapely.get_coordinates(ring) for ring in rings],
+                colors="0.2",
+                linewidths=0.6,
+            )
         )
     part.set_xlim(centre_um[0] - reach_um, centre_um[0] + reach_um)
     part.set_ylim(centre_um[1] - reach_um, centre_um[1] + reach_um)
     part.set(xticks=[], yticks=[], xlabel="", ylabel="")
-    for axes, title in ((sizes, "sizes"), (seen, "a photograph"), (part, "around the centre")):
+    for axes, title in (
+        (sizes, "sizes"),
+        (seen, "a photograph"),
+        (part, "around the centre"),
+    ):
         axes.set_title(title, fontsize=11)
     return figure
 
@@ -319,7 +393,9 @@ def write_thumbnail(picture: Path, thumbnail: Path) -> None:
     n_y = min(image.height, round(TALLEST * image.width))
     white = Image.new("RGBA", (image.width, n_y), "white")
     white.alpha_composite(image.crop((0, 0, image.width, n_y)))
-    ImageOps.pad(white.convert("RGB"), THUMBNAIL_PX, color="white").save(thumbnail, quality=88)
+    ImageOps.pad(white.convert("RGB"), THUMBNAIL_PX, color="white").save(
+        thumbnail, quality=88
+    )
 
 
 def write_gallery(_app: Sphinx, _config: Config) -> None:
@@ -332,7 +408,9 @@ def write_gallery(_app: Sphinx, _config: Config) -> None:
         folder = GALLERY / script.stem
         done = folder / "done"
         is_skipped = "import torch" in script.read_text() and not find_spec("torch")
-        if not is_skipped and (not done.exists() or done.stat().st_mtime < script.stat().st_mtime):
+        if not is_skipped and (
+            not done.exists() or done.stat().st_mtime < script.stat().st_mtime
+        ):
             folder.mkdir(parents=True, exist_ok=True)
             with with_dark_variants():
                 runpy.run_path(str(script))["main"](folder)
@@ -345,24 +423,44 @@ def write_gallery(_app: Sphinx, _config: Config) -> None:
         ]
         if is_skipped and not pictures:
             kept = sorted(PICTURES.glob(f"{script.stem[:2]}_*.png"))
-            pictures = [f"../pictures/{picture.name}" for picture in kept if not picture.stem.endswith(SUFFIX)]
+            pictures = [
+                f"../pictures/{picture.name}"
+                for picture in kept
+                if not picture.stem.endswith(SUFFIX)
+            ]
             folder.mkdir(parents=True, exist_ok=True)
         page = page_of(script, title, pictures, WITHOUT_TORCH if is_skipped else "")
         (GALLERY / f"{script.stem}.md").write_text(page)
         question = read_script(script).question
         if pictures:
             write_thumbnail(GALLERY / pictures[0], folder / "thumbnail.jpg")
-        thumbnail = f":img-top: {script.stem}/thumbnail.jpg\n:img-alt: {title}\n" if pictures else ""
+        thumbnail = (
+            f":img-top: {script.stem}/thumbnail.jpg\n:img-alt: {title}\n"
+            if pictures
+            else ""
+        )
         cards[int(script.stem[:2])] = (
             f":::{{grid-item-card}} {title}\n:link: {script.stem}\n:link-type: doc\n{thumbnail}\n{question}\n:::"
         )
     about = "Each script generates its pictures when the site is built, and checks its figures."
     listed = {number for numbers in CHAPTERS.values() for number in numbers}
-    chapters = {**CHAPTERS, "More": tuple(number for number in cards if number not in listed)}
-    stems = {int(script.stem[:2]): script.stem for script in gallery_scripts(REPOSITORY)}
-    contents = "\n".join(stems[number] for numbers in chapters.values() for number in numbers)
+    chapters = {
+        **CHAPTERS,
+        "More": tuple(number for number in cards if number not in listed),
+    }
+    stems = {
+        int(script.stem[:2]): script.stem for script in gallery_scripts(REPOSITORY)
+    }
+    contents = "\n".join(
+        stems[number] for numbers in chapters.values() for number in numbers
+    )
     page = [f"# Gallery\n\n{about}\n\n```{{toctree}}\n:hidden:\n\n{contents}\n```"]
     for chapter, numbers in chapters.items():
         if numbers:
-            page += [f"## {chapter}", "::::{grid} 1 2 3 3\n:gutter: 3", *(cards[number] for number in numbers), "::::"]
+            page += [
+                f"## {chapter}",
+                "::::{grid} 1 2 3 3\n:gutter: 3",
+                *(cards[number] for number in numbers),
+                "::::",
+            ]
     (GALLERY / "index.md").write_text("\n\n".join(page) + "\n")

@@ -35,7 +35,10 @@ N_SAMPLES = 2
 
 def frame_um(bounds_um: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return bounds with the same centre, a margin, and the aspect ratio of thumbnails."""
-    centre_um, size_um = 0.5 * (bounds_um[:2] + bounds_um[2:]), bounds_um[2:] - bounds_um[:2]
+    centre_um, size_um = (
+        0.5 * (bounds_um[:2] + bounds_um[2:]),
+        bounds_um[2:] - bounds_um[:2],
+    )
     scale_um = (1.0 + MARGIN) * max(size_um[0] / WIDTH_PX, size_um[1] / HEIGHT_PX)
     half_um = 0.5 * scale_um * np.array([WIDTH_PX, HEIGHT_PX])
     return np.concatenate([centre_um - half_um, centre_um + half_um])
@@ -59,7 +62,9 @@ def has_equal_sizes(layout: fs.Layout) -> bool:
 
 def layout_picture(layout: fs.Layout) -> NDArray[np.uint8]:
     """Return a layout in the colours of its filters or sizes, transparent around it, top row first."""
-    pixels = SitePixels.from_layout(layout, (HEIGHT_PX, WIDTH_PX), window_um(layout), n_samples=N_SAMPLES)
+    pixels = SitePixels.from_layout(
+        layout, (HEIGHT_PX, WIDTH_PX), window_um(layout), n_samples=N_SAMPLES
+    )
     has_filters = has_equal_sizes(layout) and layout.channel.max() > 0
     colours = colours_of(layout, "channel" if has_filters else "size_um")
     return pixels.picture(colours.rgb, background=None, boundary=BOUNDARY)[::-1]
@@ -68,7 +73,9 @@ def layout_picture(layout: fs.Layout) -> NDArray[np.uint8]:
 def shot_picture(path: Path) -> NDArray[np.uint8]:
     """Return the picture of a shot, transparent around its layout, top row first."""
     shot = read_shot(path)
-    capture = shot.camera.capture(shot.scene, exposure_s=shot.requested_s, seed=shot.seed)
+    capture = shot.camera.capture(
+        shot.scene, exposure_s=shot.requested_s, seed=shot.seed
+    )
     bounds_um = frame_um(np.array(capture.layout.bounds_um))
     pitch_um = (bounds_um[2] - bounds_um[0]) / WIDTH_PX
     grid = fs.Grid((HEIGHT_PX, WIDTH_PX), pitch_um, (bounds_um[0], bounds_um[1]))
@@ -78,7 +85,11 @@ def shot_picture(path: Path) -> NDArray[np.uint8]:
 def thumbnail(name: str) -> Image.Image:
     """Return the thumbnail of a preset by its name, such as ``"layout:giotto_1"``."""
     path = preset_paths()[name]
-    found = shot_picture(path) if name.startswith("shot:") else layout_picture(read_layout_file(path).layout)
+    found = (
+        shot_picture(path)
+        if name.startswith("shot:")
+        else layout_picture(read_layout_file(path).layout)
+    )
     return Image.fromarray(found)
 
 

@@ -19,10 +19,13 @@ from playwright.sync_api import Page, sync_playwright
 
 PICTURES = Path(__file__).parent / "pictures"
 WIDTH, HEIGHT, TIMEOUT_MS = 1440, 900, 120_000
-SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-LOADED = (
-    "document.querySelector('#start img') && [...document.querySelectorAll('#start img')].every((one) => one.complete)"
+SOFTWARE = (
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
 )
+LOADED = "document.querySelector('#start img') && [...document.querySelectorAll('#start img')].every((one) => one.complete)"
 SKIP_START = "localStorage.setItem('foveasim-studio-start', 'never')"
 READY = "studio.isIdle"
 
@@ -50,7 +53,9 @@ def choose(page: Page, key: str, label: str) -> None:
 def show(page: Page, *names: str) -> None:
     """Show exactly these tiles."""
     for button in page.locator("#tabs button").all():
-        if (button.get_attribute("data-tile") in names) != (button.get_attribute("aria-pressed") == "true"):
+        if (button.get_attribute("data-tile") in names) != (
+            button.get_attribute("aria-pressed") == "true"
+        ):
             button.click()
     wait_for_views(page)
 
@@ -113,7 +118,9 @@ def chip(page: Page, directory: Path) -> Path:
     page.click("#fit")
     page.click("#edit")
     page.click("[data-tool=layer]")
-    page.locator(".tool-options").get_by_label("Generator").select_option(label="log polar")
+    page.locator(".tool-options").get_by_label("Generator").select_option(
+        label="log polar"
+    )
     page.get_by_label("Margin in µm").fill("0.5")
     page.mouse.click(*at(page, 0.5, 0.5))
     wait_for_views(page)
@@ -154,13 +161,22 @@ def main() -> None:
         try:
             assert server.stdout is not None
             line = server.stdout.readline()
-            address = next(word.rstrip(";,") for word in line.split() if word.startswith("http"))
-            browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(SOFTWARE))
+            address = next(
+                word.rstrip(";,") for word in line.split() if word.startswith("http")
+            )
+            browser = playwright.chromium.launch(
+                executable_path=shutil.which("chromium"), args=list(SOFTWARE)
+            )
             temporary = Path(directory)
             tasks = {
                 "light": ("light", wait_for_views),
                 "start": ("light", start),
-                "photograph": ("light", lambda page: photograph(page, Path(str(files("skimage.data") / "coffee.png")))),
+                "photograph": (
+                    "light",
+                    lambda page: photograph(
+                        page, Path(str(files("skimage.data") / "coffee.png"))
+                    ),
+                ),
                 "square": ("dark", foveal_against_square),
                 "chip": ("light", lambda page: chip(page, temporary)),
                 "lecture": ("dark", lambda page: lecture(page, temporary)),
@@ -181,7 +197,9 @@ def main() -> None:
                 task(page)
                 screenshot = Image.open(io.BytesIO(page.screenshot()))
                 # 256 colours: a third of the size.
-                screenshot.convert("RGB").quantize(256).save(PICTURES / f"studio_{name}.png", optimize=True)
+                screenshot.convert("RGB").quantize(256).save(
+                    PICTURES / f"studio_{name}.png", optimize=True
+                )
                 context.close()
             browser.close()
         finally:

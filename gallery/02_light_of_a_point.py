@@ -1,10 +1,11 @@
 """
 Which fraction of the energy of a point source falls on a square photosite?
 
-New here: ``Scene.point_sources``, ``Optics.power_map``, ``Integrator``, ``Layout.from_rectangles``.
+New here: ``Scene.point_sources``, ``Optics.power_map``, ``Integrator``,
+``Layout.from_rectangles``.
 
-Expect: an ensquared energy of 52.889 % (within 0.001 %) in a square of side wavelength x f-number, the textbook value of the
-Airy pattern.
+Expect: an ensquared energy of 52.889 % (within 0.001 %) in a square of side wavelength
+x f-number, the textbook value of the Airy pattern.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ def main(out_dir: Path) -> None:
     """Write the curve of ensquared energy to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
     # %% One point on the axis; nine cells of the power map per wavelength x f-number.
-    optics = fs.Optics(focal_length_mm=22.0, f_number=4.0, padding="periodic", precision="double")
+    optics = fs.Optics(
+        focal_length_mm=22.0, f_number=4.0, padding="periodic", precision="double"
+    )
     lambda_n_um = 1e-3 * WAVELENGTH_NM * optics.working_f_number(DISTANCE_M)
     scene = fs.Scene.point_sources(
         shape=SHAPE,
@@ -42,7 +45,8 @@ def main(out_dir: Path) -> None:
     )
     power_map = optics.power_map(scene)
 
-    # %% Squares centred on the point, with edges on cell boundaries, where the integral is exact.
+    # %% Squares centred on the point, with edges on cell boundaries, where the integral
+    # is exact.
     squares = fs.Layout.from_rectangles(np.zeros((SIDES.size, 2)), SIDES * lambda_n_um)
     power = fs.Integrator(squares, power_map.grid)(power_map.data)[0]
     ensquared = power / (power_map.data.sum() * power_map.grid.cell_area_um2)
@@ -57,7 +61,10 @@ def main(out_dir: Path) -> None:
 
     # %% Check.
     at_lambda_n = float(ensquared[CELLS // 2])
-    print(f"{100 * at_lambda_n:.3f} % of the energy in a square of side wavelength x f-number")
+    print(
+        f"{100 * at_lambda_n:.3f} % of the energy in a square of side wavelength "
+        "x f-number"
+    )
     assert abs(at_lambda_n - 0.52889) < 1e-5
 
 

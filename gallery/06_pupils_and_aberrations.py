@@ -1,12 +1,15 @@
 """
-How do the pupil shape and the aberrations of a lens affect the images of a point and of a letter?
+How do the pupil shape and the aberrations of a lens affect the images of a point and of
+a letter?
 
-New here: ``Optics(pupil=, zernike=, seidel=, focus_distance_m=)``, ``Optics.psf``, ``.mtf``, ``.strehl``,
-``.field_error``.
+New here: ``Optics(pupil=, zernike=, seidel=, focus_distance_m=)``, ``Optics.psf``,
+``.mtf``, ``.strehl``, ``.field_error``.
 
-Expect: diffraction spikes perpendicular to edges and vanes; a coma flare in +y, where its wavefront error increases; Strehl
-ratios of 0.814 to 0.817 for 1/14 wave rms of any aberration; a field of points with flares away from the axis, computed with
-7 x 7 isoplanatic patches, which displace up to a third of the PSF energy when each fringe counts.
+Expect: diffraction spikes perpendicular to edges and vanes; a coma flare in +y, where
+its wavefront error increases; Strehl ratios of 0.814 to 0.817 for 1/14 wave rms of any
+aberration; a field of points with flares away from the axis, computed with 7 x 7
+isoplanatic patches, which displace up to a third of the PSF energy when each fringe
+counts.
 """
 
 from __future__ import annotations
@@ -30,7 +33,11 @@ SPACING_MM = 3.6
 #: Half the side of the PSFs.
 EXTENT_UM = 14.0
 LENS = {"focal_length_mm": 10.0, "f_number": 4.0}
-LIGHT = {"distance_m": DISTANCE_M, "wavelength_nm": [WAVELENGTH_NM], "band_width_nm": 10.0}
+LIGHT = {
+    "distance_m": DISTANCE_M,
+    "wavelength_nm": [WAVELENGTH_NM],
+    "band_width_nm": 10.0,
+}
 #: Wavefront error for a Strehl ratio of about 0.8 (Marechal criterion), waves rms.
 MARECHAL_WAVES = 1.0 / 14.0
 #: Frequencies of the MTF for a test of the script.
@@ -38,7 +45,7 @@ QUICK = {"n_frequencies": 30}
 
 
 def half_moon(x: np.ndarray, y: np.ndarray, wavelength_nm: float) -> np.ndarray:  # noqa: ARG001 -- signature of pupil functions
-    """Return the transmission of a user-defined pupil: the upper half, decreasing in x."""
+    """Return the transmission of a pupil: the upper half, decreasing in x."""
     return (y > 0.0) * (1.0 - 0.4 * (1.0 + x))
 
 
@@ -47,7 +54,9 @@ def pupils() -> dict[str, fs.Optics]:
     return {
         "clear circle": fs.Optics(**LENS),
         "annulus": fs.Optics(pupil=parts.Annulus(0.5), **LENS),
-        "three vanes": fs.Optics(pupil=(parts.Annulus(0.3), parts.Spider(3, 0.03, angle_deg=90.0)), **LENS),
+        "three vanes": fs.Optics(
+            pupil=(parts.Annulus(0.3), parts.Spider(3, 0.03, angle_deg=90.0)), **LENS
+        ),
         "five blades": fs.Optics(pupil=parts.Blades(5, angle_deg=90.0), **LENS),
         "user function": fs.Optics(pupil=half_moon, **LENS),
     }
@@ -59,22 +68,35 @@ def aberrations() -> dict[str, fs.Optics]:
     return {
         "no aberration": fs.Optics(**LENS),
         "defocus": fs.Optics(focus_distance_m=0.65, **LENS),
-        "coma in y": fs.Optics(zernike=parts.Zernike(coefficients={7: 0.3}, **waves), **LENS),
-        "astigmatism": fs.Optics(zernike=parts.Zernike(coefficients={6: 0.25}, **waves), **LENS),
-        "spherical": fs.Optics(zernike=parts.Zernike(coefficients={11: 0.25}, **waves), **LENS),
+        "coma in y": fs.Optics(
+            zernike=parts.Zernike(coefficients={7: 0.3}, **waves), **LENS
+        ),
+        "astigmatism": fs.Optics(
+            zernike=parts.Zernike(coefficients={6: 0.25}, **waves), **LENS
+        ),
+        "spherical": fs.Optics(
+            zernike=parts.Zernike(coefficients={11: 0.25}, **waves), **LENS
+        ),
     }
 
 
 def draw(lenses: dict[str, fs.Optics], n_frequencies: int) -> Figure:
-    """Draw the PSF and the image of a letter of each lens, and the MTF of all along x and y."""
+    """Draw PSF and image of a letter of each lens, and the MTF of all."""
     letter = charts.letter_f(
-        height_mm=3.0, shape=(160, 160), pitch_um=32.0, radiance_w_m2_sr_nm=0.1, contrast=1.0, **LIGHT
+        height_mm=3.0,
+        shape=(160, 160),
+        pitch_um=32.0,
+        radiance_w_m2_sr_nm=0.1,
+        contrast=1.0,
+        **LIGHT,
     )
     per_mm = np.linspace(0.0, 460.0, n_frequencies)
     figure = Figure(figsize=(8.0, 6.6), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(1.0, 0.9))
     mtf = below.add_subplot()
-    for k, ((name, lens), column) in enumerate(zip(lenses.items(), above.subplots(2, len(lenses)).T, strict=True)):
+    for k, ((name, lens), column) in enumerate(
+        zip(lenses.items(), above.subplots(2, len(lenses)).T, strict=True)
+    ):
         psf = lens.psf(WAVELENGTH_NM, distance_m=DISTANCE_M)
         highest = psf.psf_per_um2.max()
         left, bottom, right, top = psf.grid.bounds_um
@@ -86,24 +108,42 @@ def draw(lenses: dict[str, fs.Optics], n_frequencies: int) -> Figure:
             cmap="magma",
         )
         column[0].set(xlim=(-EXTENT_UM, EXTENT_UM), ylim=(-EXTENT_UM, EXTENT_UM))
-        column[0].set_title(f"{name}\nStrehl {lens.strehl(WAVELENGTH_NM, distance_m=DISTANCE_M):.2f}", fontsize=11)
-        column[1].imshow(lens.power_map(letter).data[0], origin="lower", cmap="gray", vmin=0.0)
+        column[0].set_title(
+            f"{name}\nStrehl {lens.strehl(WAVELENGTH_NM, distance_m=DISTANCE_M):.2f}",
+            fontsize=11,
+        )
+        column[1].imshow(
+            lens.power_map(letter).data[0], origin="lower", cmap="gray", vmin=0.0
+        )
         for axes in column:
             axes.set(xticks=[], yticks=[])
         for angle_deg, style in ((0.0, "-"), (90.0, "--")):
-            contrast = lens.mtf(per_mm, WAVELENGTH_NM, angle_deg=angle_deg, distance_m=DISTANCE_M)
-            mtf.plot(per_mm, contrast, style, color=f"C{k}", label=name if angle_deg == 0.0 else None)
+            contrast = lens.mtf(
+                per_mm, WAVELENGTH_NM, angle_deg=angle_deg, distance_m=DISTANCE_M
+            )
+            mtf.plot(
+                per_mm,
+                contrast,
+                style,
+                color=f"C{k}",
+                label=name if angle_deg == 0.0 else None,
+            )
     above.axes[0].set_ylabel(f"PSF, {2 * EXTENT_UM:.0f} µm")
     above.axes[len(lenses)].set_ylabel("letter")
     mtf.plot([], [], "--", color="0.5", label="along y")
-    mtf.set(xlabel="spatial frequency / (lp/mm)", ylabel="MTF", ylim=(0.0, 1.0), xlim=(0.0, per_mm[-1]))
+    mtf.set(
+        xlabel="spatial frequency / (lp/mm)",
+        ylabel="MTF",
+        ylim=(0.0, 1.0),
+        xlim=(0.0, per_mm[-1]),
+    )
     mtf.grid(color="0.85")
     mtf.legend(frameon=False)
     return figure
 
 
 def enlarged(power_map: fs.PowerMap, spacing_um: float) -> np.ndarray:
-    """Return the images of a grid of points, of which only the surroundings are shown, top row first."""
+    """Return the surroundings of the images of a grid of points, top row first."""
     half = int(0.5 * spacing_um / 3.0 / power_map.grid.pitch_x_um)
     cells = power_map.data[0] ** 0.4
 
@@ -123,28 +163,51 @@ def main(out_dir: Path, n_frequencies: int = 200) -> None:
     save_figure(draw(pupils(), n_frequencies), out_dir / "06_pupils.png", dpi=140)
 
     # %% Aberrations of a circular pupil.
-    save_figure(draw(aberrations(), n_frequencies), out_dir / "06_aberrations.png", dpi=140)
+    save_figure(
+        draw(aberrations(), n_frequencies), out_dir / "06_aberrations.png", dpi=140
+    )
 
-    # %% Field of points through a lens with coma and astigmatism that increase with field height.
-    points = charts.point_grid(shape=(360, 480), pitch_um=60.0, spacing_mm=SPACING_MM, intensity_w_sr_nm=1e-6, **LIGHT)
+    # %% Field of points through a lens with coma and astigmatism that increase with
+    # field height.
+    points = charts.point_grid(
+        shape=(360, 480),
+        pitch_um=60.0,
+        spacing_mm=SPACING_MM,
+        intensity_w_sr_nm=1e-6,
+        **LIGHT,
+    )
     field = fs.Optics(
-        **LENS, seidel=parts.Seidel(coma_um=1.2, astigmatism_um=0.6, field_radius_um=300.0), field_patches=7
+        **LENS,
+        seidel=parts.Seidel(coma_um=1.2, astigmatism_um=0.6, field_radius_um=300.0),
+        field_patches=7,
     )
     figure = Figure(figsize=(8.0, 3.4), layout="constrained")
     for position, (name, lens) in enumerate(
-        {"no aberrations": fs.Optics(**LENS), "coma, astigmatism": field}.items(), start=1
+        {"no aberrations": fs.Optics(**LENS), "coma, astigmatism": field}.items(),
+        start=1,
     ):
         axes = figure.add_subplot(1, 2, position)
         axes.imshow(
-            enlarged(lens.power_map(points), 1000.0 * SPACING_MM * lens.magnification(DISTANCE_M)), cmap="magma"
+            enlarged(
+                lens.power_map(points),
+                1000.0 * SPACING_MM * lens.magnification(DISTANCE_M),
+            ),
+            cmap="magma",
         )
-        axes.set(title=name, xticks=[], yticks=[], xlabel="points of the field, each enlarged 3 ×")
+        axes.set(
+            title=name,
+            xticks=[],
+            yticks=[],
+            xlabel="points of the field, each enlarged 3 ×",
+        )
     save_figure(figure, out_dir / "06_field.png", dpi=140)
 
     # %% Checks.
     waves = {"unit": "waves", "wavelength_nm": WAVELENGTH_NM}
     for j, name in {4: "defocus", 6: "astigmatism", 7: "coma", 11: "spherical"}.items():
-        aberrated = fs.Optics(zernike=parts.Zernike(coefficients={j: MARECHAL_WAVES}, **waves), **LENS)
+        aberrated = fs.Optics(
+            zernike=parts.Zernike(coefficients={j: MARECHAL_WAVES}, **waves), **LENS
+        )
         strehl = aberrated.strehl(WAVELENGTH_NM)
         print(f"{name:>12}: Strehl {strehl:.4f} for 1/14 wave rms")
         assert abs(strehl - np.exp(-((2.0 * np.pi * MARECHAL_WAVES) ** 2))) < 4e-3

@@ -3,8 +3,8 @@ Where does a layout violate its design rules, and by how much?
 
 New here: ``Layout.check`` on a layout with deliberate violations, ``Report.plot``.
 
-Expect: the 2 slivers, 1 overlap, 2 pixels below the minimum size and 1 narrow space that are inserted into a grid of 60 sites,
-and no other violation.
+Expect: the 2 slivers, 1 overlap, 2 pixels below the minimum size and 1 narrow space
+that are inserted into a grid of 60 sites, and no other violation.
 """
 
 from __future__ import annotations
@@ -27,11 +27,25 @@ RULES = fs.DesignRules(
     max_overlap_um2=0.0,
     min_angle_deg=30.0,
 )
-#: Inserted violations: width of a sliver, side of a small pixel, width of an overlap, width of a space.
+#: Inserted violations: width of a sliver, side of a small pixel, width of an overlap,
+#: width of a space.
 SLIVER_UM, SMALL_SIDE_UM, OVERLAP_UM, SPACE_UM = 0.6, 1.5, 0.4, 0.2
 #: Sites with violations, and their names in the figure.
-INSERTED = {12: "sliver", 47: "sliver", 25: "too small", 36: "too small", 8: "overlap", 42: "narrow space"}
-EXPECTED = {"min_width_um": 2, "min_size_um": 2, "min_space_um": 2, "max_overlap_um2": 1, "min_angle_deg": 0}
+INSERTED = {
+    12: "sliver",
+    47: "sliver",
+    25: "too small",
+    36: "too small",
+    8: "overlap",
+    42: "narrow space",
+}
+EXPECTED = {
+    "min_width_um": 2,
+    "min_size_um": 2,
+    "min_space_um": 2,
+    "max_overlap_um2": 1,
+    "min_angle_deg": 0,
+}
 
 
 def layout_with_violations() -> fs.Layout:
@@ -41,7 +55,9 @@ def layout_with_violations() -> fs.Layout:
     sites = list(regular.polygons())
     for site, width_um in ((12, SLIVER_UM), (47, SLIVER_UM + 0.2)):
         x0, y0, _, y1 = boxes[site]
-        sites[site] = shapely.box(x0, y0 - 0.4, x0 + width_um, y1 + 0.4).union(shapely.box(x0, y0, x0 + 3.0, y0 + 1.5))
+        sites[site] = shapely.box(x0, y0 - 0.4, x0 + width_um, y1 + 0.4).union(
+            shapely.box(x0, y0, x0 + 3.0, y0 + 1.5)
+        )
     for site in (25, 36):
         x0, y0, _, _ = boxes[site]
         sites[site] = shapely.box(x0, y0, x0 + SMALL_SIDE_UM, y0 + SMALL_SIDE_UM)
@@ -58,15 +74,27 @@ def main(out_dir: Path) -> None:
     layout = layout_with_violations()
     report = layout.check(RULES)
 
-    # %% Photosites in grey, violations in the colours of their rules, and the names of what is inserted.
+    # %% Photosites in grey, violations in the colours of their rules, and the names of
+    # what is inserted.
     print(report)
     axes = report.plot(layout, figure_inches=8.0)
     for site, text in INSERTED.items():
         arrow = {"arrowstyle": "->", "color": "black"}
         box = {"boxstyle": "round", "facecolor": "white", "edgecolor": "0.6"}
         x_um, y_um = layout.centroid_um[site]
-        at_um = (x_um + (3.2 if x_um < 0.0 else -3.2), y_um + (2.9 if y_um < 0.0 else -2.9))
-        axes.annotate(text, (x_um, y_um), at_um, arrowprops=arrow, bbox=box, ha="center", fontsize=10)
+        at_um = (
+            x_um + (3.2 if x_um < 0.0 else -3.2),
+            y_um + (2.9 if y_um < 0.0 else -2.9),
+        )
+        axes.annotate(
+            text,
+            (x_um, y_um),
+            at_um,
+            arrowprops=arrow,
+            bbox=box,
+            ha="center",
+            fontsize=10,
+        )
     save_figure(axes.figure, out_dir / "12_violations.png", dpi=140)
 
     # %% Checks.
@@ -75,7 +103,9 @@ def main(out_dir: Path) -> None:
     assert np.isclose(worst["min_width_um"], SLIVER_UM)
     assert np.isclose(worst["min_size_um"], SMALL_SIDE_UM)
     # Sites that overlap have no space between them.
-    spaces_um = next(result.values for result in report.results if result.rule == "min_space_um")
+    spaces_um = next(
+        result.values for result in report.results if result.rule == "min_space_um"
+    )
     assert np.allclose(spaces_um, [0.0, SPACE_UM])
     assert np.isclose(worst["max_overlap_um2"], OVERLAP_UM * 3.0)
 

@@ -1,10 +1,12 @@
 """
 Which solids does the stack of a foveal sensor consist of?
 
-New here: ``view.SensorStack``, ``view.solids``, ``view.stack``, ``Solids.check``, ``Solids.write``, ``view.render``.
+New here: ``view.SensorStack``, ``view.solids``, ``view.stack``, ``Solids.check``,
+``Solids.write``, ``view.render``.
 
-Expect: wells, trenches, filters and lenses of 546 sites as closed solids that do not overlap; wells and trenches whose volumes
-add up to the silicon below the sites within 1e-9, 88.8 % of it in the wells; the same solids in a file for a web page or a 3D
+Expect: wells, trenches, filters and lenses of 546 sites as closed solids that do not
+overlap; wells and trenches whose volumes add up to the silicon below the sites within
+1e-9, 88.8 % of it in the wells; the same solids in a file for a web page or a 3D
 printer.
 """
 
@@ -18,7 +20,8 @@ import numpy as np
 import foveasim as fs
 from foveasim import view
 
-#: Trenches have the depth of the wells; filters and lenses have the thickness that is common for small pixels.
+#: Trenches have the depth of the wells; filters and lenses have the thickness that is
+#: common for small pixels.
 STACK = view.SensorStack(
     well_depth_um=6.0,
     trench_width_um=0.3,
@@ -31,8 +34,13 @@ MAX_ERROR = 1e-9
 
 
 def foveal_layout() -> fs.Layout:
-    """Return a small retina with a colour mosaic, rotated so that no trench is parallel to a cut."""
-    rings = fs.layout.giotto(n_rho=18, n_theta=40, n_fovea=7, n_across=62, unit_um=2.0, chords_per_arc=3)
+    """
+    Return a small retina with a colour mosaic, rotated so that no trench is parallel to
+    a cut.
+    """
+    rings = fs.layout.giotto(
+        n_rho=18, n_theta=40, n_fovea=7, n_across=62, unit_um=2.0, chords_per_arc=3
+    )
     return fs.layout.mosaic(rings, ("RG", "GB")).rotate(2.0)
 
 
@@ -61,16 +69,24 @@ def main(out_dir: Path) -> None:
     # %% Checks.
     report = solids.check()
     for part in report.parts:
-        print(f"{part.name:>9}: {part.n_triangles:7,} triangles, {part.volume_um3:9,.1f} µm³")
+        print(
+            f"{part.name:>9}: {part.n_triangles:7,} triangles, "
+            f"{part.volume_um3:9,.1f} µm³"
+        )
     silicon_um3 = layout.area_um2 * STACK.well_depth_um
     well_fraction = solids.volumes_um3("wells").sum() / silicon_um3.sum()
     print(f"{layout.n_sites:,} sites; wells contain {well_fraction:.1%} of the silicon")
     assert report.ok
     assert np.allclose(
-        solids.volumes_um3("wells") + solids.volumes_um3("trenches"), silicon_um3, rtol=MAX_ERROR, atol=0.0
+        solids.volumes_um3("wells") + solids.volumes_um3("trenches"),
+        silicon_um3,
+        rtol=MAX_ERROR,
+        atol=0.0,
     )
     narrowed = fs.layout.inset(layout, STACK.trench_width_um / 2)
-    assert abs(well_fraction - narrowed.area_um2.sum() / layout.area_um2.sum()) < MAX_ERROR
+    assert (
+        abs(well_fraction - narrowed.area_um2.sum() / layout.area_um2.sum()) < MAX_ERROR
+    )
     assert layout.n_sites == 546
     assert abs(well_fraction - 0.888) < 0.001
 

@@ -1,12 +1,13 @@
 """
 How do a rolling shutter, event pixels and spiking pixels record a rotating fan?
 
-New here: ``Camera.video`` and ``Camera.rates``, ``foveasim.video.FrameSource``, ``foveasim.modes``: ``EventPixels`` and
-``SpikingPixels``.
+New here: ``Camera.video`` and ``Camera.rates``, ``foveasim.video.FrameSource``,
+``foveasim.modes``: ``EventPixels`` and ``SpikingPixels``.
 
-Expect: blades distorted by a rolling shutter with a line time of 0.25 ms, and a bar at 1.92 µm/ms that is skewed by 0.48 µm per
-line; ON events at the leading edge of every blade and OFF events at its trailing edge, on photosites of 0.7 to 6 µm, which give
-the rotation rate of 5 turns per second within 1 %.
+Expect: blades distorted by a rolling shutter with a line time of 0.25 ms, and a bar at
+1.92 µm/ms that is skewed by 0.48 µm per line; ON events at the leading edge of every
+blade and OFF events at its trailing edge, on photosites of 0.7 to 6 µm, which give the
+rotation rate of 5 turns per second within 1 %.
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ def fan() -> Iterator[np.ndarray]:
     for k in range(N_FRAMES):
         phase = N_BLADES * (angle - 2.0 * np.pi * TURNS_PER_S * FRAME_S * k)
         to_edge = radius * np.arcsin(np.sin(phase)) / N_BLADES
-        disc = np.clip(0.48 * N_SIDE - radius, 0.0, 1.0) * np.clip(radius - 6.0, 0.0, 1.0)
+        disc = np.clip(0.48 * N_SIDE - radius, 0.0, 1.0) * np.clip(
+            radius - 6.0, 0.0, 1.0
+        )
         yield BACKGROUND + (1.0 - BACKGROUND) * np.clip(to_edge + 0.5, 0.0, 1.0) * disc
 
 
@@ -69,11 +72,23 @@ def frame_source(pictures: Iterator[np.ndarray]) -> FrameSource:
     )
 
 
-def plot_sites(axes: Axes, layout: fs.Layout, values: np.ndarray, colours: str, limit: float, title: str) -> None:
-    """Plot values of sites on a scale from 0, or from the negative limit, to the limit."""
+def plot_sites(
+    axes: Axes,
+    layout: fs.Layout,
+    values: np.ndarray,
+    colours: str,
+    limit: float,
+    title: str,
+) -> None:
+    """
+    Plot values of sites on a scale from 0, or from the negative limit, to
+    the limit.
+    """
     low = -limit if values.min() < 0 else 0.0
     rings = np.split(layout.xy_um, layout.ring_offsets[1:-1])
-    shapes = PolyCollection(rings, array=values, cmap=colours, edgecolors="face", linewidths=0.2)
+    shapes = PolyCollection(
+        rings, array=values, cmap=colours, edgecolors="face", linewidths=0.2
+    )
     shapes.set_clim(low, limit)
     axes.add_collection(shapes)
     axes.autoscale_view()
@@ -85,21 +100,34 @@ def main(out_dir: Path) -> None:
     out_dir.mkdir(parents=True, exist_ok=True)
     optics = fs.Optics(focal_length_mm=FOCAL_LENGTH_MM, f_number=2.8)
 
-    # %% A sensor read row by row, from the top of the picture, and one exposure with each shutter.
+    # %% A sensor read row by row, from the top of the picture, and one exposure with
+    # each shutter.
     grid = readout_by(fs.layout.grid(n_x=N_LINES, n_y=N_LINES, pitch_um=PITCH_UM))
-    camera = fs.Camera(optics=optics, sensor=fs.Sensor(grid, bits=12, capacitance_f=5e-15, read_noise_e=3.0))
+    camera = fs.Camera(
+        optics=optics,
+        sensor=fs.Sensor(grid, bits=12, capacitance_f=5e-15, read_noise_e=3.0),
+    )
     times = {"exposure_s": EXPOSURE_S, "seed": 1, "frame_s": FRAME_S, "every": N_FRAMES}
     global_shutter = next(camera.video(frame_source(fan()), **times))
-    rolling_shutter = next(camera.video(frame_source(fan()), **times, line_s=LINE_S, between="linear"))
+    rolling_shutter = next(
+        camera.video(frame_source(fan()), **times, line_s=LINE_S, between="linear")
+    )
     skewed = next(camera.video(frame_source(bar()), **times, line_s=LINE_S))
 
     # %% Skew of the bar per line.
-    signal_e = np.maximum(skewed.expected_e.reshape(N_LINES, N_LINES) - 1.5 * np.median(skewed.expected_e), 0.0)
+    signal_e = np.maximum(
+        skewed.expected_e.reshape(N_LINES, N_LINES)
+        - 1.5 * np.median(skewed.expected_e),
+        0.0,
+    )
     centroid_um = signal_e @ grid.centroid_um[:N_LINES, 0] / signal_e.sum(axis=1)
     skew_um = np.polyfit(np.arange(N_LINES)[::-1], centroid_um, 1)[0]
     cell_um = optics.magnification(DISTANCE_M) * SCENE_PITCH_UM
     expected_um = BAR_PX_PER_FRAME * cell_um / FRAME_S * LINE_S
-    print(f"skew of the bar: {skew_um:.4f} µm per line; speed times line time: {expected_um:.4f} µm")
+    print(
+        f"skew of the bar: {skew_um:.4f} µm per line; speed times line time: "
+        f"{expected_um:.4f} µm"
+    )
 
     # %% The same fan on rings of event pixels and of spiking pixels.
     rings = fs.layout.log_polar(n_sectors=96, n_rings=36, r_min_um=10.0, r_max_um=100.0)
@@ -115,18 +143,25 @@ def main(out_dir: Path) -> None:
         noise_per_s=0.5,
     )
     events = pixels.events(rates, frame_s=FRAME_S, seed=2)
-    spikes = SpikingPixels(foveal.sensor, threshold_e=SPIKE_E).events(rates, frame_s=FRAME_S, seed=3)
+    spikes = SpikingPixels(foveal.sensor, threshold_e=SPIKE_E).events(
+        rates, frame_s=FRAME_S, seed=3
+    )
 
-    # %% Rotation rate with the highest phase coherence of ON events relative to the blades.
+    # %% Rotation rate with the highest phase coherence of ON events relative to the
+    # blades.
     angle = np.arctan2(rings.centroid_um[:, 1], rings.centroid_um[:, 0])
     is_on = events.polarity > 0
     on_s, on_angle = events.t_s[is_on], angle[events.site[is_on]]
     candidates = np.linspace(3.0, 7.0, 4001)
     coherence = [
-        abs(np.exp(1j * N_BLADES * (on_angle - 2.0 * np.pi * candidate * on_s)).sum()) for candidate in candidates
+        abs(np.exp(1j * N_BLADES * (on_angle - 2.0 * np.pi * candidate * on_s)).sum())
+        for candidate in candidates
     ]
     turns_per_s = candidates[int(np.argmax(coherence))]
-    print(f"{len(events):,} events:\n{turns_per_s:.3f} turns per second; {len(spikes):,} spikes")
+    print(
+        f"{len(events):,} events:\n{turns_per_s:.3f} turns per second; "
+        f"{len(spikes):,} spikes"
+    )
 
     # %% Figure.
     figure = Figure(figsize=(8.0, 10.6), layout="constrained")
@@ -141,19 +176,45 @@ def main(out_dir: Path) -> None:
         max_dn,
         f"rolling shutter, {1e3 * LINE_S:g} ms per line,\nbottom first",
     )
-    plot_sites(axes[0, 2], grid, skewed.code, "gray", max_dn, f"moving bar,\nskew {skew_um:.3f} µm per line")
+    plot_sites(
+        axes[0, 2],
+        grid,
+        skewed.code,
+        "gray",
+        max_dn,
+        f"moving bar,\nskew {skew_um:.3f} µm per line",
+    )
     last = events.between(FRAME_S * (N_FRAMES - 1) - 4e-3, FRAME_S * N_FRAMES)
     balance = (last.counts(polarity=1) - last.counts(polarity=-1)).astype(np.float64)
-    plot_sites(axes[1, 0], rings, balance, "RdBu", 4.0, "events of the last 4 ms:\nON blue, OFF red")
+    plot_sites(
+        axes[1, 0],
+        rings,
+        balance,
+        "RdBu",
+        4.0,
+        "events of the last 4 ms:\nON blue, OFF red",
+    )
     for polarity, colour in ((1, "tab:blue"), (-1, "tab:red")):
         is_shown = events.polarity == polarity
-        axes[1, 1].plot(1e3 * events.t_s[is_shown], np.degrees(angle[events.site[is_shown]]), ",", color=colour)
-    axes[1, 1].set(xlabel="time / ms", ylabel="angle of the site / degrees", ylim=(-180, 180))
+        axes[1, 1].plot(
+            1e3 * events.t_s[is_shown],
+            np.degrees(angle[events.site[is_shown]]),
+            ",",
+            color=colour,
+        )
+    axes[1, 1].set(
+        xlabel="time / ms", ylabel="angle of the site / degrees", ylim=(-180, 180)
+    )
     axes[1, 1].set_title(f"{len(events):,} events: {turns_per_s:.3f} turns per second")
     early = spikes.between(0.0, 4e-3)
     per_s = early.counts() / 4e-3
     plot_sites(
-        axes[1, 2], rings, per_s, "gray", float(np.quantile(per_s, 0.99)), "spikes per second\nin the first 4 ms"
+        axes[1, 2],
+        rings,
+        per_s,
+        "gray",
+        float(np.quantile(per_s, 0.99)),
+        "spikes per second\nin the first 4 ms",
     )
     save_figure(figure, out_dir / "20_events_and_rolling_shutter.png", dpi=140)
 

@@ -1,10 +1,11 @@
 """
 Which foveal sensors give the best picture for their number of photosites?
 
-New here: ``foveasim.explore.study``: a search with two objectives and a constraint, with a Pareto front.
+New here: ``foveasim.explore.study``: a search with two objectives and a constraint,
+with a Pareto front.
 
-Expect: about ten of 40 sensors on the Pareto front, all with photosites on at least 92 % of the field; along the front, PSNR
-increases with the number of photosites.
+Expect: about ten of 40 sensors on the Pareto front, all with photosites on at least 92
+% of the field; along the front, PSNR increases with the number of photosites.
 """
 
 from __future__ import annotations
@@ -36,9 +37,20 @@ SHOT = {
     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
     "layout": {
         "generator": "log_polar",
-        "parameters": {"n_sectors": 128, "min_size_um": 2.0, "r_max_um": FIELD_RADIUS_UM, "stagger": True},
+        "parameters": {
+            "n_sectors": 128,
+            "min_size_um": 2.0,
+            "r_max_um": FIELD_RADIUS_UM,
+            "stagger": True,
+        },
     },
-    "sensor": {"qe": 0.6, "capacitance_f": {"per_um2": 3.0e-16}, "read_noise_e": 1.0, "v_sat_v": 3.0, "bits": 12},
+    "sensor": {
+        "qe": 0.6,
+        "capacitance_f": {"per_um2": 3.0e-16},
+        "read_noise_e": 1.0,
+        "v_sat_v": 3.0,
+        "bits": 12,
+    },
     "exposure_s": 0.01,
 }
 N_TRIALS = 40
@@ -60,11 +72,18 @@ def main(out_dir: Path, n_trials: int = N_TRIALS) -> None:
         SHOT,
         {
             "layout.parameters.n_sectors": {"from": 32, "to": 192, "step": 4},
-            "layout.parameters.min_size_um": {"from": 0.5, "to": 4.0, "spacing": "geometric"},
+            "layout.parameters.min_size_um": {
+                "from": 0.5,
+                "to": 4.0,
+                "spacing": "geometric",
+            },
         },
         {"psnr_db": "maximize", "n_sites": "minimize"},
         constraints={"covered_fraction": (MIN_COVERED_FRACTION, None)},
-        metrics={**{name: METRICS[name] for name in ("psnr_db", "n_sites")}, "covered_fraction": covered_fraction},
+        metrics={
+            **{name: METRICS[name] for name in ("psnr_db", "n_sites")},
+            "covered_fraction": covered_fraction,
+        },
         n_trials=n_trials,
         seed=1,
         storage=out_dir / "22_study.db",
@@ -75,10 +94,23 @@ def main(out_dir: Path, n_trials: int = N_TRIALS) -> None:
     # %% All trials, and the Pareto front.
     figure = Figure(figsize=(7.6, 5.0), layout="constrained")
     ax = figure.subplots()
-    is_feasible = np.array([trial.user_attrs["covered_fraction"] >= MIN_COVERED_FRACTION for trial in trials])
+    is_feasible = np.array(
+        [
+            trial.user_attrs["covered_fraction"] >= MIN_COVERED_FRACTION
+            for trial in trials
+        ]
+    )
     psnr_db, n_sites = np.array([trial.values for trial in trials]).T
-    size_um = np.array([trial.params["layout.parameters.min_size_um"] for trial in trials])
-    ax.plot(n_sites[~is_feasible], psnr_db[~is_feasible], "x", color="0.6", label="blind spot too large")
+    size_um = np.array(
+        [trial.params["layout.parameters.min_size_um"] for trial in trials]
+    )
+    ax.plot(
+        n_sites[~is_feasible],
+        psnr_db[~is_feasible],
+        "x",
+        color="0.6",
+        label="blind spot too large",
+    )
     ax.plot(
         [trial.values[1] for trial in front],
         [trial.values[0] for trial in front],
@@ -97,18 +129,29 @@ def main(out_dir: Path, n_trials: int = N_TRIALS) -> None:
     colour_bar = figure.colorbar(points, ax=ax, label="smallest photosite / µm")
     colour_bar.ax.set_yticks([0.5, 1, 2, 4], ["0.5", "1", "2", "4"])
     colour_bar.ax.set_yticks([], minor=True)
-    ax.set(xscale="log", xlabel="photosites", ylabel="PSNR relative to the optical image / dB")
+    ax.set(
+        xscale="log",
+        xlabel="photosites",
+        ylabel="PSNR relative to the optical image / dB",
+    )
     ax.grid(color="0.9")
     ax.legend(frameon=False)
     save_figure(figure, out_dir / "22_study.png", dpi=140)
 
     # %% Checks.
     for trial in front:
-        settings = ", ".join(f"{path.rpartition('.')[2]} {value:.3g}" for path, value in trial.params.items())
-        print(f"{trial.values[1]:7,.0f} photosites, {trial.values[0]:.1f} dB: {settings}")
+        settings = ", ".join(
+            f"{path.rpartition('.')[2]} {value:.3g}"
+            for path, value in trial.params.items()
+        )
+        print(
+            f"{trial.values[1]:7,.0f} photosites, {trial.values[0]:.1f} dB: {settings}"
+        )
     assert len(trials) == n_trials
     assert 7 <= len(front) <= 14
-    assert all(trial.user_attrs["covered_fraction"] >= MIN_COVERED_FRACTION for trial in front)
+    assert all(
+        trial.user_attrs["covered_fraction"] >= MIN_COVERED_FRACTION for trial in front
+    )
     assert all(np.diff([trial.values[0] for trial in front]) > 0.0)
 
 

@@ -1,10 +1,13 @@
 """
-How are user-defined effects added to a sensor: 1/f noise of the readout, and lens shading?
+How are user-defined effects added to a sensor: 1/f noise of the readout, and lens
+shading?
 
-New here: ``sensor.effects.AdditiveNoise``, ``sensor.effects.FixedFactor``, ``Sensor(effects=)``, ``plot_noise_budget``.
+New here: ``sensor.effects.AdditiveNoise``, ``sensor.effects.FixedFactor``,
+``Sensor(effects=)``, ``plot_noise_budget``.
 
-Expect: both effects in captures, in the prediction and in the noise budget without further code; temporal noise that agrees
-with the prediction within 1 %; a shading loss of 30 % in the corners.
+Expect: both effects in captures, in the prediction and in the noise budget without
+further code; temporal noise that agrees with the prediction within 1 %; a shading loss
+of 30 % in the corners.
 """
 
 from __future__ import annotations
@@ -39,19 +42,34 @@ class FlickerNoise(AdditiveNoise):
         """Return the standard deviation in V, which gives the moments of the noise."""
         return self.sigma_v
 
-    def apply(self, values: np.ndarray, *, sites: Sites, rng: np.random.Generator) -> np.ndarray:
-        """Return voltages with a noise sequence in readout order, the same for all blocks of sites."""
+    def apply(
+        self, values: np.ndarray, *, sites: Sites, rng: np.random.Generator
+    ) -> np.ndarray:
+        """
+        Return voltages with a noise sequence in readout order, the same for all blocks
+        of sites.
+        """
         n_sites = sites.layout.n_sites
         frequency = np.fft.rfftfreq(n_sites)
-        amplitude = np.divide(1.0, np.sqrt(frequency), out=np.zeros(frequency.size), where=frequency > 0.0)
+        amplitude = np.divide(
+            1.0, np.sqrt(frequency), out=np.zeros(frequency.size), where=frequency > 0.0
+        )
         amplitude *= n_sites / np.sqrt(2.0 * np.sum(amplitude**2))
-        white = (rng.standard_normal(frequency.size) + 1j * rng.standard_normal(frequency.size)) / np.sqrt(2.0)
-        return values + self.sigma_v * sites.select(np.fft.irfft(amplitude * white, n_sites))
+        white = (
+            rng.standard_normal(frequency.size)
+            + 1j * rng.standard_normal(frequency.size)
+        ) / np.sqrt(2.0)
+        return values + self.sigma_v * sites.select(
+            np.fft.irfft(amplitude * white, n_sites)
+        )
 
 
 @dataclass(frozen=True)
 class LensShading(FixedFactor):
-    """Shading loss of a lens, proportional to the square of the distance from the axis."""
+    """
+    Shading loss of a lens, proportional to the square of the distance from
+    the axis.
+    """
 
     name = "lens_shading"
     stage = "photo"
@@ -71,9 +89,17 @@ def main(out_dir: Path) -> None:
     layout = fs.layout.grid(n_x=N_SIDE, n_y=N_SIDE, pitch_um=3.0)
     user_effects = [FlickerNoise(sigma_v=6e-3), LensShading(corner_loss=0.3)]
     sensor = fs.Sensor(
-        layout, effects=user_effects, read_noise_e=5.0, capacitance_f=1e-15, v_sat_v=1.0, bits=12, pedestal_v=0.1
+        layout,
+        effects=user_effects,
+        read_noise_e=5.0,
+        capacitance_f=1e-15,
+        v_sat_v=1.0,
+        bits=12,
+        pedestal_v=0.1,
     )
-    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    camera = fs.Camera(
+        optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    )
     rate_e_per_s = np.full(layout.n_sites, 2e5)
     power_map = fs.PowerMap.from_array(
         np.full((N_SIDE, N_SIDE), 2e5 * fs.units.photon_energy_j(550.0) / (3e-6) ** 2),
@@ -82,12 +108,29 @@ def main(out_dir: Path) -> None:
     )
 
     # %% Frames of uniform irradiance, and their prediction.
-    frames = np.stack([camera.capture(power_map, exposure_s=EXPOSURE_S, seed=1, frame=k).code for k in range(N_FRAMES)])
+    frames = np.stack(
+        [
+            camera.capture(power_map, exposure_s=EXPOSURE_S, seed=1, frame=k).code
+            for k in range(N_FRAMES)
+        ]
+    )
     mean_dn, variance_dn2 = camera.predict(power_map, exposure_s=EXPOSURE_S)
     figure = Figure(figsize=(8.0, 3.1), layout="constrained")
-    pictures = {"one frame": frames[0], "mean of the frames": frames.mean(axis=0), "predicted mean": mean_dn}
-    for axes, (title, values) in zip(figure.subplots(1, 3), pictures.items(), strict=True):
-        axes.imshow(values.reshape(N_SIDE, N_SIDE), origin="lower", cmap="gray", vmin=mean_dn.min(), vmax=mean_dn.max())
+    pictures = {
+        "one frame": frames[0],
+        "mean of the frames": frames.mean(axis=0),
+        "predicted mean": mean_dn,
+    }
+    for axes, (title, values) in zip(
+        figure.subplots(1, 3), pictures.items(), strict=True
+    ):
+        axes.imshow(
+            values.reshape(N_SIDE, N_SIDE),
+            origin="lower",
+            cmap="gray",
+            vmin=mean_dn.min(),
+            vmax=mean_dn.max(),
+        )
         axes.set_title(title)
         axes.set_axis_off()
     save_figure(figure, out_dir / "25_own_effects.png", dpi=140)
@@ -101,13 +144,20 @@ def main(out_dir: Path) -> None:
     # %% Checks.
     ratio = np.sqrt(frames.var(axis=0, ddof=1).mean() / variance_dn2.mean())
     corner_loss = 1.0 - sensor.response[0]
-    print(f"temporal noise / prediction: {ratio:.4f}; shading loss in the corners: {100 * corner_loss:.0f} %")
+    print(
+        f"temporal noise / prediction: {ratio:.4f}; shading loss in the corners: "
+        f"{100 * corner_loss:.0f} %"
+    )
     assert abs(ratio - 1.0) < 0.01
     assert abs(corner_loss - 0.3) < 1e-9
     assert budget["flicker"].min() > 0.0
-    # The shading is the same in all devices, and reduces photon shot noise in the corners.
+    # The shading is the same in all devices, and reduces photon shot noise in the
+    # corners.
     assert budget["lens_shading"].max() == 0.0
-    assert abs(budget["photon_shot"].min() ** 2 / (rate_e_per_s[0] * EXPOSURE_S) - 0.7) < 1e-9
+    assert (
+        abs(budget["photon_shot"].min() ** 2 / (rate_e_per_s[0] * EXPOSURE_S) - 0.7)
+        < 1e-9
+    )
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
 """
-What does a fovea gain over a square grid with the same number of photosites, and what does it cost?
+What does a fovea gain over a square grid with the same number of photosites, and what
+does it cost?
 
-New here: ``n_sites=`` of layout generators, and ``foveasim.compare``: pictures, quality by eccentricity and information of
-cameras at equal budget.
+New here: ``n_sites=`` of layout generators, and ``foveasim.compare``: pictures, quality
+by eccentricity and information of cameras at equal budget.
 
-Expect: of two sensors with 4,096 photosites, the foveal one has a PSNR at least 5 dB higher around the gaze, at least 2 dB
-lower in the periphery, and at least 3 times as much information per area at the gaze; the total information differs by less
-than 40 %.
+Expect: of two sensors with 4,096 photosites, the foveal one has a PSNR at least 5 dB
+higher around the gaze, at least 2 dB lower in the periphery, and at least 3 times as
+much information per area at the gaze; the total information differs by less than 40 %.
 """
 
 from __future__ import annotations
@@ -32,10 +33,16 @@ METRICS = ("psnr_db", "snr_mean_db", "information_bit_per_mm2")
 def compare(n_sites: int) -> fs.compare.Comparison:
     """Compare a foveal and a square layout of the same number of sites and width."""
     foveal = fs.layout.log_polar(
-        n_sites=n_sites, min_size_um=MIN_SIZE_UM, r_max_um=FIELD_UM / 2.0, fovea="rings", stagger=True
+        n_sites=n_sites,
+        min_size_um=MIN_SIZE_UM,
+        r_max_um=FIELD_UM / 2.0,
+        fovea="rings",
+        stagger=True,
     )
     square = fs.layout.grid(n_sites=n_sites, size_um=(FIELD_UM, FIELD_UM))
-    return fs.compare.layouts({"foveal": foveal, "square": square}, n_annuli=6, max_pixels=192)
+    return fs.compare.layouts(
+        {"foveal": foveal, "square": square}, n_annuli=6, max_pixels=192
+    )
 
 
 def draw(found: fs.compare.Comparison) -> Figure:
@@ -67,7 +74,8 @@ def main(out_dir: Path, n_sites: int = N_SITES) -> None:
     found = compare(n_sites)
     print(found)
 
-    # %% Pictures of one scene, and measures against eccentricity; bands are 95 % intervals of the median over the scenes.
+    # %% Pictures of one scene, and measures against eccentricity; bands are 95 %
+    # intervals of the median over the scenes.
     figure = draw(found)
     save_figure(figure, out_dir / "26_foveal_against_square.png", dpi=140)
 

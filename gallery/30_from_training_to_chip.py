@@ -1,12 +1,13 @@
 """
 Does a learned layout survive design rules and fabrication?
 
-New here: ``foveasim.learn.barrier`` repairs a learned layout, which is written as GDSII, read back, and measured with captures
-of photographs.
+New here: ``foveasim.learn.barrier`` repairs a learned layout, which is written as
+GDSII, read back, and measured with captures of photographs.
 
-Expect: an error of 4.3 ± 0.1 % for the learned layout, with about 60 violations of the rules, against 5.2 % of the uniform
-grid. Repaired by gradients and read from the GDSII file it has no violations, and an error of 4.2 %. A repair that merges
-and drops photosites leaves 88 of 144, with an error of 18 % (three seeds, ``--full``).
+Expect: an error of 4.3 ± 0.1 % for the learned layout, with about 60 violations of the
+rules, against 5.2 % of the uniform grid. Repaired by gradients and read from the GDSII
+file it has no violations, and an error of 4.2 %. A repair that merges and drops
+photosites leaves 88 of 144, with an error of 18 % (three seeds, ``--full``).
 """
 
 from __future__ import annotations
@@ -34,24 +35,36 @@ from foveasim.view import save_figure
 
 #: Pitch of the uniform grid; map cells are 1 µm wide.
 PITCH_UM = 3
-#: Rules of the chip, and rules of the repair, with a margin for vertices on the database grid of 1 nm.
+#: Rules of the chip, and rules of the repair, with a margin for vertices on the
+#: database grid of 1 nm.
 RULES = fs.DesignRules(
-    min_size_um=2.0, min_width_um=1.8, min_angle_deg=60.0, angle_limit_deg=26.0, max_overlap_um2=0.0, max_gap_um2=0.0
+    min_size_um=2.0,
+    min_width_um=1.8,
+    min_angle_deg=60.0,
+    angle_limit_deg=26.0,
+    max_overlap_um2=0.0,
+    max_gap_um2=0.0,
 )
-STRICT = fs.DesignRules(min_size_um=2.01, min_width_um=1.81, min_angle_deg=60.5, angle_limit_deg=26.0)
+STRICT = fs.DesignRules(
+    min_size_um=2.01, min_width_um=1.81, min_angle_deg=60.5, angle_limit_deg=26.0
+)
 #: Much weaker rules of training: sites remain convex, which the repair requires.
 WEAK = fs.DesignRules(min_width_um=0.75, min_angle_deg=40.0, angle_limit_deg=26.0)
-#: Model of pictures for training: 1/f² spectrum, standard deviation relative to the mean, blur of the lens.
+#: Model of pictures for training: 1/f² spectrum, standard deviation relative to the
+#: mean, blur of the lens.
 CONTRAST, BLUR_UM, MODES_FRACTION = 0.5, 0.65, 0.9999
-#: Importance of errors: a Gaussian around the gaze, with a standard deviation relative to the field, plus a constant.
+#: Importance of errors: a Gaussian around the gaze, with a standard deviation relative
+#: to the field, plus a constant.
 GAZE_SD, PERIPHERY = 1.0 / 6.0, 0.02
 #: Photoelectrons per area at the mean of the pictures, and read noise per site.
 ELECTRONS_PER_UM2, READ_NOISE_E = 100.0, 3.0
-#: Initial displacements, learning rates in training and repair, and weight of the violations.
+#: Initial displacements, learning rates in training and repair, and weight of the
+#: violations.
 JITTER_UM, TRAINING_RATE_UM, REPAIR_RATE_UM, BARRIER = 0.2, 0.1, 0.05, 1e-3
 #: Steps that repair violations, without the error.
 REPAIR_STEPS = 300
-#: Photographs, all unknown to training: width of a pixel on the sensor, and of the margin around the field.
+#: Photographs, all unknown to training: width of a pixel on the sensor, and of the
+#: margin around the field.
 PHOTOGRAPHS = ("astronaut", "camera", "coffee", "chelsea")
 PIXEL_UM, MARGIN_UM = 0.25, 8
 DISTANCE_M, EXPOSURE_S, RADIANCE_W_M2_SR_NM = 1.0, 0.01, 0.006
@@ -94,29 +107,56 @@ class Task:
         spectrum = np.exp(-f2 * (2.0 * np.pi * BLUR_UM) ** 2) / (f2 + (0.5 / n) ** 2)
         correlation = np.fft.ifft2(spectrum).real
         y, x = np.divmod(np.arange(n**2), n)
-        covariance = CONTRAST**2 / correlation[0, 0] * correlation[np.subtract.outer(y, y), np.subtract.outer(x, x)]
+        covariance = (
+            CONTRAST**2
+            / correlation[0, 0]
+            * correlation[np.subtract.outer(y, y), np.subtract.outer(x, x)]
+        )
         variance, vectors = np.linalg.eigh(covariance)
-        n_modes = 1 + int(np.searchsorted(np.cumsum(variance[::-1]), MODES_FRACTION * variance.sum()))
-        modes = (vectors[:, ::-1] * np.sqrt(np.maximum(variance[::-1], 0.0)))[:, :n_modes]
+        n_modes = 1 + int(
+            np.searchsorted(np.cumsum(variance[::-1]), MODES_FRACTION * variance.sum())
+        )
+        modes = (vectors[:, ::-1] * np.sqrt(np.maximum(variance[::-1], 0.0)))[
+            :, :n_modes
+        ]
         squared = (np.arange(n) + 0.5 - 0.5 * n) ** 2
-        importance = PERIPHERY + np.exp(-0.5 * np.add.outer(squared, squared) / (GAZE_SD * n) ** 2)
+        importance = PERIPHERY + np.exp(
+            -0.5 * np.add.outer(squared, squared) / (GAZE_SD * n) ** 2
+        )
         return cls(
             fs.Grid.centred((n, n), 1.0),
             importance,
-            torch.from_numpy(np.ascontiguousarray(modes.T, np.float32)).reshape(n_modes, n, n),
-            torch.from_numpy((modes.T @ (importance.reshape(-1, 1) * modes)).astype(np.float32)),
+            torch.from_numpy(np.ascontiguousarray(modes.T, np.float32)).reshape(
+                n_modes, n, n
+            ),
+            torch.from_numpy(
+                (modes.T @ (importance.reshape(-1, 1) * modes)).astype(np.float32)
+            ),
         )
 
     def error(self, mesh: Mesh) -> Tensor:
-        """Compute the error of the best linear reconstruction, relative to the variance."""
+        """
+        Compute the error of the best linear reconstruction, relative to the
+        variance.
+        """
         points = mesh()
-        response = site_power(points, self.modes, mesh, self.grid, order=2, n_threads=1).T
-        noise = mesh.outlines.area_um2(points).float() / ELECTRONS_PER_UM2 + (READ_NOISE_E / ELECTRONS_PER_UM2) ** 2
-        explained = torch.linalg.solve(response @ response.T + torch.diag(noise), response @ self.products @ response.T)
+        response = site_power(
+            points, self.modes, mesh, self.grid, order=2, n_threads=1
+        ).T
+        noise = (
+            mesh.outlines.area_um2(points).float() / ELECTRONS_PER_UM2
+            + (READ_NOISE_E / ELECTRONS_PER_UM2) ** 2
+        )
+        explained = torch.linalg.solve(
+            response @ response.T + torch.diag(noise),
+            response @ self.products @ response.T,
+        )
         return 1.0 - explained.trace() / self.products.trace()
 
 
-def optimise(mesh: Mesh, loss: Callable[[Mesh], Tensor], n_steps: int, rate_um: float) -> None:
+def optimise(
+    mesh: Mesh, loss: Callable[[Mesh], Tensor], n_steps: int, rate_um: float
+) -> None:
     """Minimise a function of a mesh."""
     optimiser = torch.optim.Adam(mesh.parameters(), lr=rate_um)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, n_steps)
@@ -133,20 +173,39 @@ def penalty(mesh: Mesh, rules: fs.DesignRules) -> Tensor:
     return barrier(mesh(), mesh, rules, convex=True)
 
 
-def design(task: Task, n_x: int, n_steps: int, seed: int, path: Path) -> dict[str, fs.Layout]:
+def design(
+    task: Task, n_x: int, n_steps: int, seed: int, path: Path
+) -> dict[str, fs.Layout]:
     """Return the layout of every stage, from the grid to the GDSII file."""
-    layouts = {"uniform grid": fs.layout.grid(n_x, size_um=(float(n_x * PITCH_UM),) * 2)}
+    layouts = {
+        "uniform grid": fs.layout.grid(n_x, size_um=(float(n_x * PITCH_UM),) * 2)
+    }
     mesh = Mesh(layouts["uniform grid"])
     with torch.no_grad():
-        mesh.displacement_um.normal_(0.0, JITTER_UM, generator=torch.Generator().manual_seed(seed))
+        mesh.displacement_um.normal_(
+            0.0, JITTER_UM, generator=torch.Generator().manual_seed(seed)
+        )
     mesh.limit_step()
-    optimise(mesh, lambda one: task.error(one) + BARRIER * penalty(one, WEAK), n_steps, TRAINING_RATE_UM)
+    optimise(
+        mesh,
+        lambda one: task.error(one) + BARRIER * penalty(one, WEAK),
+        n_steps,
+        TRAINING_RATE_UM,
+    )
     layouts["learned"] = mesh.layout()
     # Merging leaves gaps where a merged site still violates a rule.
-    layouts["merged"] = layouts["learned"].enforce(RULES.only(lambda name: name != "max_gap_um2"), repair="merge")[0]
-    # Violations first: their large gradients would shorten all later steps of the same optimiser.
+    layouts["merged"] = layouts["learned"].enforce(
+        RULES.only(lambda name: name != "max_gap_um2"), repair="merge"
+    )[0]
+    # Violations first: their large gradients would shorten all later steps of the same
+    # optimiser.
     optimise(mesh, lambda one: penalty(one, STRICT), REPAIR_STEPS, REPAIR_RATE_UM)
-    optimise(mesh, lambda one: task.error(one) + BARRIER * penalty(one, STRICT), n_steps // 2, REPAIR_RATE_UM)
+    optimise(
+        mesh,
+        lambda one: task.error(one) + BARRIER * penalty(one, STRICT),
+        n_steps // 2,
+        REPAIR_RATE_UM,
+    )
     layouts["repaired"] = mesh.layout()
     layouts["repaired"].write(path)
     layouts["from GDSII"] = read_layout(path)
@@ -176,12 +235,17 @@ def camera(layout: fs.Layout) -> fs.Camera:
 
 
 def photographs(n_pixels: int, n: int, seed: int) -> list[NDArray[np.uint8]]:
-    """Return square parts of photographs: the face of the astronaut, and random ones."""
+    """
+    Return square parts of photographs: the face of the astronaut, and
+    random ones.
+    """
     rng, half = np.random.default_rng(seed), n_pixels // 2
     parts = []
     for k in range(n):
         photograph = getattr(skimage.data, PHOTOGRAPHS[k % len(PHOTOGRAPHS)])()
-        row, column = (int(rng.integers(half, size - half)) for size in photograph.shape[:2])
+        row, column = (
+            int(rng.integers(half, size - half)) for size in photograph.shape[:2]
+        )
         if k == 0:
             row, column = FACE
         parts.append(photograph[row - half : row + half, column - half : column + half])
@@ -190,15 +254,23 @@ def photographs(n_pixels: int, n: int, seed: int) -> list[NDArray[np.uint8]]:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Error of all photographs in percent, and the first one with its reference, in e-/µm²."""
+    """
+    Error of all photographs in percent, and the first one with its reference, in
+    e-/µm².
+    """
 
     error_percent: float
     picture: NDArray[np.float64]
     reference: NDArray[np.float64]
 
 
-def measure(task: Task, layout: fs.Layout, pictures: Sequence[NDArray[np.uint8]], seed: int) -> Measurement:
-    """Capture and reconstruct photographs; the error is relative to their weighted variance."""
+def measure(
+    task: Task, layout: fs.Layout, pictures: Sequence[NDArray[np.uint8]], seed: int
+) -> Measurement:
+    """
+    Capture and reconstruct photographs; the error is relative to their weighted
+    variance.
+    """
     chip, shown, squares, variance = camera(layout), [], 0.0, 0.0
     for k, picture in enumerate(pictures):
         scene = fs.Scene.from_picture(
@@ -209,18 +281,30 @@ def measure(task: Task, layout: fs.Layout, pictures: Sequence[NDArray[np.uint8]]
             wavelength_nm=(550.0,),
             band_width_nm=50.0,
         )
-        capture = chip.capture(scene, exposure_s=EXPOSURE_S, seed=seed * len(pictures) + k)
-        found = capture.picture("least_squares", of="light_e", per="um2", grid=task.grid, sensor=chip.sensor).data[0]
+        capture = chip.capture(
+            scene, exposure_s=EXPOSURE_S, seed=seed * len(pictures) + k
+        )
+        found = capture.picture(
+            "least_squares", of="light_e", per="um2", grid=task.grid, sensor=chip.sensor
+        ).data[0]
         found = np.where(np.isnan(found), np.nanmean(found), found)  # no photosites
         true = chip.reference(scene, task.grid, exposure_s=EXPOSURE_S).data[0]
         squares += np.average((found - true) ** 2, weights=task.importance)
-        variance += np.average((true - np.average(true, weights=task.importance)) ** 2, weights=task.importance)
+        variance += np.average(
+            (true - np.average(true, weights=task.importance)) ** 2,
+            weights=task.importance,
+        )
         shown.append((found, true))
     return Measurement(100.0 * squares / variance, *shown[0])
 
 
-def draw_stages(task: Task, stages: Mapping[str, tuple[fs.Layout, Measurement]]) -> Figure:
-    """Draw layouts with their violations, reconstructions of the same photograph, and their errors."""
+def draw_stages(
+    task: Task, stages: Mapping[str, tuple[fs.Layout, Measurement]]
+) -> Figure:
+    """
+    Draw layouts with their violations, reconstructions of the same photograph, and
+    their errors.
+    """
     figure = Figure(figsize=(7.6, 6.4), layout="constrained")
     axes = figure.subplots(3, 1 + len(stages))
     (importance, image, unused), stage_axes = axes[:, 0], axes[:, 1:].T
@@ -239,32 +323,66 @@ def draw_stages(task: Task, stages: Mapping[str, tuple[fs.Layout, Measurement]])
     draw(image, first.reference, "optical image")
     unused.axis("off")
     errors = None
-    for (above, centre, below), (name, (layout, measurement)) in zip(stage_axes, stages.items(), strict=True):
+    for (above, centre, below), (name, (layout, measurement)) in zip(
+        stage_axes, stages.items(), strict=True
+    ):
         results = layout.check(RULES).results
-        sites = {site for result in results for violation in result.violations for site in violation.site_ids}
-        colours = ["#f4b6ae" if site in sites else "0.93" for site in range(layout.n_sites)]
+        sites = {
+            site
+            for result in results
+            for violation in result.violations
+            for site in violation.site_ids
+        }
+        colours = [
+            "#f4b6ae" if site in sites else "0.93" for site in range(layout.n_sites)
+        ]
         outlines = [get_coordinates(polygon) for polygon in layout.polygons()]
-        above.add_collection(PolyCollection(outlines, facecolor=colours, edgecolor="0.35", linewidth=0.6))
+        above.add_collection(
+            PolyCollection(outlines, facecolor=colours, edgecolor="0.35", linewidth=0.6)
+        )
         above.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
-        above.set_title(f"{name}\n{count_violations(layout)} violations", fontsize="medium")
+        above.set_title(
+            f"{name}\n{count_violations(layout)} violations", fontsize="medium"
+        )
         draw(centre, measurement.picture, f"error {measurement.error_percent:.1f} %")
         difference = (measurement.picture - measurement.reference) / white
-        errors = below.imshow(difference, cmap="RdBu_r", origin="lower", vmin=-0.3, vmax=0.3, extent=extent)
+        errors = below.imshow(
+            difference,
+            cmap="RdBu_r",
+            origin="lower",
+            vmin=-0.3,
+            vmax=0.3,
+            extent=extent,
+        )
     for ax in axes.flat:
         ax.set(xticks=[], yticks=[], xlabel="")
     scale = unused.inset_axes((0.85, 0.04, 0.07, 0.92))
-    figure.colorbar(errors, cax=scale, label="difference / white").ax.yaxis.set_ticks_position("left")
+    figure.colorbar(
+        errors, cax=scale, label="difference / white"
+    ).ax.yaxis.set_ticks_position("left")
     scale.yaxis.set_label_position("left")
     return figure
 
 
-def draw_errors(errors: Mapping[str, NDArray[np.float64]], violations: Mapping[str, NDArray[np.float64]]) -> Figure:
+def draw_errors(
+    errors: Mapping[str, NDArray[np.float64]],
+    violations: Mapping[str, NDArray[np.float64]],
+) -> Figure:
     """Draw the error of every stage, with its standard deviation over the seeds."""
     figure = Figure(figsize=(7.6, 2.8), layout="constrained")
     ax = figure.subplots()
     means = [values.mean() for values in errors.values()]
-    ax.barh(range(len(errors)), means, xerr=[deviation(values) for values in errors.values()], color="0.75", capsize=3)
-    ax.set_yticks(range(len(errors)), [f"{name}: {violations[name].mean():.0f} violations" for name in errors])
+    ax.barh(
+        range(len(errors)),
+        means,
+        xerr=[deviation(values) for values in errors.values()],
+        color="0.75",
+        capsize=3,
+    )
+    ax.set_yticks(
+        range(len(errors)),
+        [f"{name}: {violations[name].mean():.0f} violations" for name in errors],
+    )
     ax.invert_yaxis()
     ax.set_xlabel("error of reconstructed photographs / % of the weighted variance")
     return figure
@@ -276,13 +394,20 @@ def deviation(values: NDArray[np.float64]) -> float:
 
 
 def main(
-    out_dir: Path, *, n_x: int = 12, n_steps: int = 150, n_pictures: int = 40, seeds: Sequence[int] = (1,)
+    out_dir: Path,
+    *,
+    n_x: int = 12,
+    n_steps: int = 150,
+    n_pictures: int = 40,
+    seeds: Sequence[int] = (1,),
 ) -> None:
     """Write a chip per seed and the figures to a directory, and print the table."""
     out_dir.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     task = Task.of_size(n_x * PITCH_UM)
-    pictures = photographs(int((n_x * PITCH_UM + MARGIN_UM) / PIXEL_UM), n_pictures, seed=0)
+    pictures = photographs(
+        int((n_x * PITCH_UM + MARGIN_UM) / PIXEL_UM), n_pictures, seed=0
+    )
 
     # %% Train, repair, write and read a chip for every seed; then photograph.
     chips, measured = [], []
@@ -290,23 +415,43 @@ def main(
         start_s = time.perf_counter()
         chips.append(design(task, n_x, n_steps, seed, out_dir / f"30_chip_{seed}.gds"))
         elapsed_s = time.perf_counter() - start_s
-        measured.append({name: measure(task, layout, pictures, seed) for name, layout in chips[-1].items()})
-        print(f"seed {seed}: training and repair {elapsed_s:.0f} s, in total {time.perf_counter() - start_s:.0f} s")
+        measured.append(
+            {
+                name: measure(task, layout, pictures, seed)
+                for name, layout in chips[-1].items()
+            }
+        )
+        print(
+            f"seed {seed}: training and repair {elapsed_s:.0f} s, in total "
+            f"{time.perf_counter() - start_s:.0f} s"
+        )
 
     # %% Table.
-    errors = {name: np.array([one[name].error_percent for one in measured]) for name in measured[0]}
-    violations = {name: np.array([count_violations(chip[name]) for chip in chips]) for name in errors}
+    errors = {
+        name: np.array([one[name].error_percent for one in measured])
+        for name in measured[0]
+    }
+    violations = {
+        name: np.array([count_violations(chip[name]) for chip in chips])
+        for name in errors
+    }
     for name, found in errors.items():
         n_sites = np.mean([chip[name].n_sites for chip in chips])
         print(
-            f"{name:14} {n_sites:5.0f} sites, {violations[name].mean():5.1f} violations, "
+            f"{name:14} {n_sites:5.0f} sites, {violations[name].mean():5.1f} "
+            "violations, "
             f"{found.mean():5.2f} ± {deviation(found):.2f} %"
         )
 
     # %% Figures.
-    shown = {name: (chips[0][name], measured[0][name]) for name in ("uniform grid", "learned", "from GDSII")}
+    shown = {
+        name: (chips[0][name], measured[0][name])
+        for name in ("uniform grid", "learned", "from GDSII")
+    }
     save_figure(draw_stages(task, shown), out_dir / "30_chips.png", dpi=140)
-    save_figure(draw_errors(errors, violations), out_dir / "30_photograph_errors.png", dpi=140)
+    save_figure(
+        draw_errors(errors, violations), out_dir / "30_photograph_errors.png", dpi=140
+    )
 
     # %% Checks: the chip satisfies the rules, at about the error of the learned layout.
     assert (violations["learned"] > 0).all()

@@ -1,11 +1,12 @@
 """
 How many photoelectrons does a photosite collect, from moonlight to sunlight?
 
-New here: ``Scene.flat(illuminance_lux=...)``, ``Camera.photoelectrons_per_s`` of photosites of many sizes.
+New here: ``Scene.flat(illuminance_lux=...)``, ``Camera.photoelectrons_per_s`` of
+photosites of many sizes.
 
-Expect: irradiance that falls with the fourth power of the cosine of the field angle (within 0.1 %), and charges in proportion
-to area and illuminance; in an office, in 1/30 s at f/2.8, a photosite of 1.4 µm collects 1,620 photoelectrons, one of 3.45 µm
-9,836.
+Expect: irradiance that falls with the fourth power of the cosine of the field angle
+(within 0.1 %), and charges in proportion to area and illuminance; in an office, in 1/30
+s at f/2.8, a photosite of 1.4 µm collects 1,620 photoelectrons, one of 3.45 µm 9,836.
 """
 
 from __future__ import annotations
@@ -23,13 +24,21 @@ DISTANCE_M = 1.0
 EXPOSURE_S = 1.0 / 30.0
 OPTICS = fs.Optics(focal_length_mm=8.0, f_number=2.8, oversample=1)
 #: Light in lux, and its name.
-LIGHTS = {0.2: "full moon", 10.0: "street lamps", 500.0: "office", 10_000.0: "overcast day"}
+LIGHTS = {
+    0.2: "full moon",
+    10.0: "street lamps",
+    500.0: "office",
+    10_000.0: "overcast day",
+}
 SIZES_UM = np.geomspace(0.7, 30.0, 15)
 N_PIXELS = 401
 
 
 def flat(pitch_um: float, illuminance_lux: float) -> fs.Scene:
-    """Return a white wall at a distance of 1 m that reflects 18 % of the light, as an average scene does."""
+    """
+    Return a white wall at a distance of 1 m that reflects 18 % of the light, as an
+    average scene does.
+    """
     return fs.Scene.flat(
         shape=(N_PIXELS, N_PIXELS),
         pitch_um=pitch_um,
@@ -51,16 +60,32 @@ def main(out_dir: Path) -> None:
     angle_deg = np.degrees(np.arctan(tangent))
     relative = cells[middle] / cells[middle, middle]
 
-    # %% Photoelectrons of squares of all sizes, side by side on the axis, in four kinds of light.
+    # %% Photoelectrons of squares of all sizes, side by side on the axis, in four kinds
+    # of light.
     places_um = np.c_[np.cumsum(SIZES_UM + 1.0) - SIZES_UM / 2, np.zeros(SIZES_UM.size)]
-    squares = fs.Layout.from_rectangles(places_um - [places_um[-1, 0] / 2, 0.0], SIZES_UM)
-    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(squares, qe=fs.SiliconQE(depth_um=3.0)))
-    electrons = {name: EXPOSURE_S * camera.photoelectrons_per_s(flat(200.0, lux)) for lux, name in LIGHTS.items()}
+    squares = fs.Layout.from_rectangles(
+        places_um - [places_um[-1, 0] / 2, 0.0], SIZES_UM
+    )
+    camera = fs.Camera(
+        optics=OPTICS, sensor=fs.Sensor(squares, qe=fs.SiliconQE(depth_um=3.0))
+    )
+    electrons = {
+        name: EXPOSURE_S * camera.photoelectrons_per_s(flat(200.0, lux))
+        for lux, name in LIGHTS.items()
+    }
 
     figure = Figure(figsize=(7.6, 4.0), layout="constrained")
     left, right = figure.subplots(1, 2)
-    left.plot(angle_deg, 100.0 * np.cos(np.radians(angle_deg)) ** 4, color="#bbbbbb", linewidth=5, label="cos⁴")
-    left.plot(angle_deg, 100.0 * relative, color="#b5403a", linewidth=1.2, label="computed")
+    left.plot(
+        angle_deg,
+        100.0 * np.cos(np.radians(angle_deg)) ** 4,
+        color="#bbbbbb",
+        linewidth=5,
+        label="cos⁴",
+    )
+    left.plot(
+        angle_deg, 100.0 * relative, color="#b5403a", linewidth=1.2, label="computed"
+    )
     left.set_xlabel("field angle / degrees")
     left.set_ylabel("irradiance / % of that on the axis")
     left.set_ylim(0, 105)
@@ -69,7 +94,9 @@ def main(out_dir: Path) -> None:
     right.set_xlabel("side of the photosite / µm")
     right.set_ylabel("photoelectrons in 1/30 s at f/2.8")
     right.set_ylim(0.1, 3e9)  # room for the legend
-    snr = right.secondary_yaxis("right", functions=(lambda e: np.sqrt(np.maximum(e, 1e-9)), np.square))
+    snr = right.secondary_yaxis(
+        "right", functions=(lambda e: np.sqrt(np.maximum(e, 1e-9)), np.square)
+    )
     snr.set_ylabel("signal-to-noise ratio with photon shot noise only")
     for axes in (left, right):
         axes.grid(visible=True, alpha=0.3)
@@ -78,7 +105,9 @@ def main(out_dir: Path) -> None:
 
     # %% Check: the closed forms.
     inner = np.abs(angle_deg) < 30.0
-    assert np.allclose(relative[inner], np.cos(np.radians(angle_deg[inner])) ** 4, rtol=1e-3)
+    assert np.allclose(
+        relative[inner], np.cos(np.radians(angle_deg[inner])) ** 4, rtol=1e-3
+    )
     office = electrons["office"]
     assert np.allclose(office / SIZES_UM**2, office[0] / SIZES_UM[0] ** 2, rtol=1e-2)
     assert np.allclose(electrons["overcast day"], 20.0 * office, rtol=1e-6)

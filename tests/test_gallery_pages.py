@@ -51,8 +51,21 @@ def test_page_shows_figures_after_their_steps(pages, tmp_path):
 
     page = pages.page_of(script, "Title", ["s/a.png", "s/b.png", "s/c.png"])
 
-    order = ["# Title", "How many?", "](s/a.png)", "Two lines of text.", "`one`", "N = 1", "`double`: Return twice", "First step, "
-             "continued.", 'save(out_dir / "a.png")', "Second step.", 'save(out_dir / "b.png")', "](s/b.png)", "](s/c.png)"]  # fmt: skip
+    order = [
+        "# Title",
+        "How many?",
+        "](s/a.png)",
+        "Two lines of text.",
+        "`one`",
+        "N = 1",
+        "`double`: Return twice",
+        "First step, continued.",
+        'save(out_dir / "a.png")',
+        "Second step.",
+        'save(out_dir / "b.png")',
+        "](s/b.png)",
+        "](s/c.png)",
+    ]
     at = [page.index(part) for part in order]
     assert at == sorted(at)
     assert page.count("s/a.png") == 1
