@@ -21,7 +21,7 @@ from foveasim.studio._messages.encoding import encode_part
 from foveasim.studio._parts import PARTS, Part
 from foveasim.studio._parts.registry import capture_of
 
-EXTENDING = Path(__file__).parents[2] / "docs" / "extending.md"
+EXTENDING = Path(__file__).parents[2] / "docs" / "extending" / "own_views.md"
 MODULES = files("foveasim.studio") / "static" / "views"
 #: Canvases of the views that are always shown.
 CANVASES = {"columns": "#map .cells", "picture": "#picture .image", "scene": "#scene .image"}
