@@ -58,7 +58,11 @@ PAGES = [page for page in [ROOT / "README.md", *pages_of(ROOT)] if BLOCK.search(
 
 
 #: Requirements of the code of pages.
-NEEDS = {"learning": [pytest.mark.needs("torch")], "viewing": [pytest.mark.needs("renderer")]}
+NEEDS = {
+    "learning": [pytest.mark.needs("torch")],
+    "learning_networks": [pytest.mark.needs("torch")],
+    "viewing": [pytest.mark.needs("renderer")],
+}
 
 
 #: Numbers in the code of pages, by what the tests compute with instead, where the page only takes longer with more.
