@@ -93,7 +93,7 @@ def sensor_layer() -> SensorLayer:
     """Return a foveal sensor of 385 photosites, with shot noise and read noise."""
     layout = fs.layout.fovi(fov_um=84.0, a_um=4.0, n_rings=15)
     sensor = fs.Sensor(layout, read_noise_e=5.0, capacitance_f=1e-15)
-    lens = fs.Optics(focal_length_mm=8.0, f_number=2.8, oversample=1)
+    lens = fs.Optics(focal_length_mm=8.0, f_number=2.8, oversample=2)
     white = np.ones((N_PIXELS, N_PIXELS))
     scene = fs.Scene.from_picture(
         white, pitch_um=999.0, distance_m=8.0, luminance_cd_m2=100.0, encoding="linear"
