@@ -23,7 +23,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 #: Targets of links and pictures, without URLs and sections of the same page.
 TARGET = re.compile(r"\]\((?![a-z]+:)([^)#\s]+)")
 #: Directories that the build writes.
-GENERATED = {"_build", "gallery", "layouts", "reference"}
+GENERATED = {"_build", "gallery", "layouts", "reference", "results"}
 
 
 def pages_of(root):
@@ -123,6 +123,38 @@ def test_tables_have_header_rows():
         wrong += [(page.stem, table) for table in tables if not re.match(r"\|.*\n\|[\s:|-]+\n", table)]
 
     assert wrong == []
+
+
+#: Columns of code for which the site has room.
+MAX_COLUMNS = 88
+FENCE = re.compile(r"^(`{3,})(.*)\n(.*?)^\1 *$", re.MULTILINE | re.DOTALL)
+
+
+def lines_of_code(text):
+    """Return the lines in fenced and indented blocks of a Markdown page."""
+    fenced = [line for block in FENCE.findall(text) for line in block[2].split("\n")]
+    return fenced + [line for line in FENCE.sub("", text).split("\n") if re.match(r" {4}(?! *[*|-] )", line)]
+
+
+@pytest.mark.parametrize(
+    ("text", "n_wide"),
+    [
+        (f"```python\n{'x' * 89}\n```\n", 1),
+        (f"a\n\n    {'x' * 85}\n", 1),
+        (f"```text\n{'x' * 88}\n```\n{'x' * 120}\n", 0),
+    ],
+)
+def test_wide_lines_of_code_are_found(text, n_wide):
+    assert sum(len(line) > MAX_COLUMNS for line in lines_of_code(text)) == n_wide
+
+
+def test_lines_of_code_fit_the_pages():
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *pages_of(ROOT)]
+    wide = [(page.name, line) for page in pages for line in lines_of_code(page.read_text()) if len(line) > MAX_COLUMNS]
+    scripts = sorted((ROOT / "gallery").glob("*.py"))
+    wide += [(path.name, line) for path in scripts for line in path.read_text().split("\n") if len(line) > MAX_COLUMNS]
+
+    assert wide == []
 
 
 def test_all_pages_are_found():
