@@ -42,7 +42,11 @@ MARECHAL_WAVES = 1.0 / 14.0
 QUICK = {"n_frequencies": 30}
 
 
-def half_moon(x: np.ndarray, y: np.ndarray, wavelength_nm: float) -> np.ndarray:  # noqa: ARG001 -- signature of pupil functions
+def half_moon(
+    x: np.ndarray,
+    y: np.ndarray,
+    wavelength_nm: float,  # noqa: ARG001 -- signature of pupil functions
+) -> np.ndarray:
     """
     Return the transmission of a user-defined pupil: the upper half,
     decreasing in x.

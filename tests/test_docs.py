@@ -127,7 +127,7 @@ def test_tables_have_header_rows():
 
 #: Columns of code for which the site has room.
 MAX_COLUMNS = 88
-FENCE = re.compile(r"^(`{3,})(.*)\n(.*?)^\1 *$", re.MULTILINE | re.DOTALL)
+FENCE = re.compile(r"^(`{3,})([^\n]*)\n(.*?)^\1 *$", re.MULTILINE | re.DOTALL)
 
 
 def lines_of_code(text):
