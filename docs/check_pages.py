@@ -1,5 +1,5 @@
 """
-Checks of the built site: results, figures, width of code, links, and ways from the home page.
+Checks of the built site: results, figures, summaries, width of code, links, home page.
 
     python docs/check_pages.py docs/_build/html        exit code 1, and a line per problem
 """
@@ -91,6 +91,16 @@ def names_without_figure(site: Path) -> Iterator[str]:
                 yield f"{name}: no figure of class {class_name}"
 
 
+def cut_summaries(site: Path) -> Iterator[str]:
+    """Yield summaries of the reference that are empty, or end within parentheses."""
+    for page in sorted((site / "reference").glob("foveasim*.html")):
+        for cells in parsed(page).xpath("//table//tr[count(td) > 1]"):
+            texts = [cell.text_content().strip() for cell in cells]
+            is_cut = texts[-1].count("(") != texts[-1].count(")")
+            if is_cut or not texts[-1]:
+                yield f"{page.relative_to(site)}: {texts[0]}: {texts[-1]!r}"
+
+
 def wide_code(site: Path) -> Iterator[str]:
     """Yield lines of code that do not fit in a page."""
     for page in pages_of(site):
@@ -156,6 +166,7 @@ def missing_from_home(site: Path) -> Iterator[str]:
 CHECKS: tuple[Callable[[Path], Iterator[str]], ...] = (
     steps_without_result,
     names_without_figure,
+    cut_summaries,
     wide_code,
     broken_links,
     missing_from_home,

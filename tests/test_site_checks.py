@@ -63,6 +63,14 @@ def test_generator_without_figure_is_found(site, body):
     assert len(found) > 1
 
 
+@pytest.mark.parametrize("summary", ["", "Read a table (cf."])
+def test_cut_summary_is_found(site, summary):
+    rows = f"<tr><td>a</td><td>Read (all of) it.</td></tr><tr><td>b</td><td>{summary}</td></tr>"
+    write(site, "reference/foveasim.layout.html", f"<table>{rows}</table>")
+
+    assert problems("cut_summaries", site) == [f"reference/foveasim.layout.html: b: {summary!r}"]
+
+
 def test_wide_line_of_code_is_found(site):
     write(site, "guide.html", f"<div class='highlight'><pre>{'x' * 88}\n{'y' * 89}</pre></div>")
 
