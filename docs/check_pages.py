@@ -102,9 +102,12 @@ def cut_summaries(site: Path) -> Iterator[str]:
 
 
 def wide_code(site: Path) -> Iterator[str]:
-    """Yield lines of code that do not fit in a page."""
+    """Yield lines of code that do not fit in a page, but for those of docstrings."""
+    blocks = "//div[@class='highlight'][not(ancestor::*[contains(@class, 'output')])]"
     for page in pages_of(site):
-        for block in parsed(page).xpath("//div[@class='highlight']//pre"):
+        if page.parent.name == "made":
+            continue
+        for block in parsed(page).xpath(f"{blocks}//pre"):
             for line in block.text_content().split("\n"):
                 if len(line) > MAX_COLUMNS:
                     where = page.relative_to(site)
