@@ -340,7 +340,13 @@ def write_home(_app: Sphinx, _config: Config) -> None:
     """Write the pictures of the home page, and that of links to the site."""
     for folder in ("home", "static"):
         (RESULTS / folder).mkdir(parents=True, exist_ok=True)
-    with Image.open(PICTURES / "31_moving_gaze.webp") as opened:
+    source, moving = PICTURES / "31_moving_gaze.webp", RESULTS / "home" / "gaze.webp"
+    if moving.exists() and moving.stat().st_mtime > source.stat().st_mtime:
+        return
+    with Image.open(PICTURES / "01_first_picture.png") as opened:
+        preview = ImageOps.pad(opened.convert("RGB"), PREVIEW_PX, color="#14181d")
+    preview.save(RESULTS / "static" / "preview.png")
+    with Image.open(source) as opened:
         shots = [
             (frame.convert("RGB").resize(GAZE_PX), frame.info.get("duration", 160))
             for frame in ImageSequence.Iterator(opened)
@@ -348,17 +354,13 @@ def write_home(_app: Sphinx, _config: Config) -> None:
     images, durations_ms = zip(*shots, strict=True)
     images[0].save(RESULTS / "home" / "gaze_still.png")
     images[0].save(
-        RESULTS / "home" / "gaze.webp",
+        moving,
         save_all=True,
         append_images=images[1:],
         duration=durations_ms,
         loop=0,
         quality=55,
-        method=6,
     )
-    with Image.open(PICTURES / "01_first_picture.png") as opened:
-        preview = ImageOps.pad(opened.convert("RGB"), PREVIEW_PX, color="#14181d")
-    preview.save(RESULTS / "static" / "preview.png")
 
 
 def write_reference_figures(_app: Sphinx, _config: Config) -> None:
