@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import io
 import pkgutil
 import re
 import runpy
@@ -353,14 +354,17 @@ def write_home(_app: Sphinx, _config: Config) -> None:
         ]
     images, durations_ms = zip(*shots, strict=True)
     images[0].save(RESULTS / "home" / "gaze_still.png")
+    encoded = io.BytesIO()
     images[0].save(
-        moving,
+        encoded,
+        "WEBP",
         save_all=True,
         append_images=images[1:],
         duration=durations_ms,
         loop=0,
         quality=55,
     )
+    moving.write_bytes(encoded.getvalue())
 
 
 def write_reference_figures(_app: Sphinx, _config: Config) -> None:
