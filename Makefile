@@ -109,10 +109,11 @@ peers: $(VENV)/.installed-dev
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --builder html docs docs/_build/html
+	$(BIN)/python docs/check_pages.py docs/_build/html
 	@echo "open docs/_build/html/index.html"
 
 clean:
-	rm -rf $(VENV) $(LOWEST) $(TORCH_VENV) $(INTEROP_VENV) out docs/_build docs/gallery docs/layouts docs/reference node_modules .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST) $(TORCH_VENV) $(INTEROP_VENV) out docs/_build docs/gallery docs/layouts docs/reference docs/results node_modules .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find foveasim tests -name __pycache__ -type d -exec rm -rf {} +
 
 $(VENV)/.made $(LOWEST)/uv/.made $(TORCH_VENV)/.made $(INTEROP_VENV)/.made:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
+import io
 import pkgutil
 import re
 import runpy
 import shutil
+import tomllib
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 import numpy as np
 import shapely
@@ -19,7 +23,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, ImageSequence
 from skimage.color import rgb2gray
 from skimage.data import astronaut
 
@@ -99,6 +103,11 @@ REGISTERED = {
     "foveasim.scene.charts": SCENES.within("foveasim.scene.charts"),
 }
 REFERENCE = Path(__file__).parent / "reference"
+#: Pictures of pages: results of their code, figures of the reference, the home page.
+RESULTS = Path(__file__).parent / "results"
+FIGURES = RESULTS / "reference"
+#: Sizes of the moving picture of the home page, and of the preview of links.
+GAZE_PX, PREVIEW_PX = (400, 400), (1200, 630)
 #: Pages of the bundled layouts.
 BUNDLED = Path(__file__).parent / "layouts"
 #: Photosites around the centre in the right part of their figures; differences of size below this are rounding.
@@ -176,7 +185,7 @@ def generated_pages(repository: Path) -> set[Path]:
         f"made/{module}.{name}.rst"
         for module, names in public_names().items()
         for name in names
-        if name not in tables_of(module, names)
+        if name not in tables_of(module, names) | constants_of(module, names)
     }
     scripts = {f"{script.stem}.md" for script in gallery_scripts(repository)}
     scripts |= {
@@ -188,9 +197,15 @@ def generated_pages(repository: Path) -> set[Path]:
         Path("layouts", page)
         for page in ("index.md", *(f"{name}.png" for name in bundled_layouts()))
     }
+    home = {
+        Path("results/home", picture) for picture in ("gaze.webp", "gaze_still.png")
+    }
     reference = {Path("reference", page) for page in {"index.md"} | modules | made}
     return (
-        layouts | reference | {Path("gallery", page) for page in {"index.md"} | scripts}
+        layouts
+        | home
+        | reference
+        | {Path("gallery", page) for page in {"index.md"} | scripts}
     )
 
 
@@ -200,6 +215,26 @@ def tables_of(name: str, names: list[str]) -> dict[str, Mapping[Any, Any]]:
     return {
         n: getattr(module, n) for n in names if isinstance(getattr(module, n), Mapping)
     }
+
+
+def constants_of(name: str, names: list[str]) -> dict[str, Any]:
+    """Return the constants and types without a class among the names of a module."""
+    module = importlib.import_module(name)
+    values = {n: getattr(module, n) for n in names if n not in tables_of(name, names)}
+    return {
+        n: value
+        for n, value in values.items()
+        if not (inspect.isroutine(value) or inspect.isclass(value))
+    }
+
+
+def shown_value(value: object) -> str:
+    """Return a constant, or the alternatives of a type, as Markdown in a table."""
+    if get_origin(value) is Literal or isinstance(value, tuple):
+        items = value if isinstance(value, tuple) else get_args(value)
+        plain = [getattr(item, "name", item) for item in items]
+        return ", ".join(f"`{item}`" for item in plain)
+    return "function" if callable(value) else f"`{value}`"
 
 
 def entry_of(value: object) -> str:
@@ -228,7 +263,9 @@ def plain_roles(text: str) -> str:
 
 def comment_on(name: str, module: str) -> str:
     """Return the comment before the definition of a constant of a module, from the module that defines it."""
-    for path in sorted((REPOSITORY / module.replace(".", "/")).rglob("*.py")):
+    home = REPOSITORY / module.replace(".", "/")
+    single = home.with_suffix(".py")
+    for path in [single] if single.exists() else sorted(home.rglob("*.py")):
         found = re.search(
             rf"((?:^#: .*\n)+){name}(?:: .*)? = ", path.read_text(), re.MULTILINE
         )
@@ -258,6 +295,7 @@ def write_reference(_app: Sphinx, _config: Config) -> None:
     public = public_names()
     for name, about in MODULES.items():
         tables = tables_of(name, public[name])
+        constants = constants_of(name, public[name])
         page = [f"# {name}", about]
         if name == "foveasim":
             main = "\n".join(f"   ~{full_name}" for full_name in main_names(public))
@@ -265,8 +303,10 @@ def write_reference(_app: Sphinx, _config: Config) -> None:
                 f"```{{eval-rst}}\n.. autosummary::\n   :nosignatures:\n\n{main}\n```"
             )
         for heading, names in sections_of(
-            name, [n for n in public[name] if n not in tables]
+            name, [n for n in public[name] if n not in tables | constants]
         ):
+            if not names:
+                continue
             rows = "\n".join(f"   {n}" for n in names)
             page.append(f"## {heading}" * bool(heading))
             page.append(
@@ -281,6 +321,14 @@ def write_reference(_app: Sphinx, _config: Config) -> None:
             page.append(
                 f"## {n}\n\n{kind}{comment_on(n, name)}\n\n| key | |\n|---|---|\n{rows}"
             )
+        rows = "\n".join(
+            f"| `{n}` | {shown_value(value)} | {comment_on(n, name)} |"
+            for n, value in constants.items()
+        )
+        page.append(
+            f"## Constants and types\n\n| name | value | |\n|---|---|---|\n{rows}"
+            * bool(rows)
+        )
         (REFERENCE / f"{name}.md").write_text("\n\n".join(filter(None, page)) + "\n")
     contents = "\n".join(MODULES)
     rows = "\n".join(
@@ -290,6 +338,109 @@ def write_reference(_app: Sphinx, _config: Config) -> None:
     table = f"| module | contents | public names |\n|---|---|---|\n{rows}"
     page_text = f"# Reference\n\n{table}\n\n```{{toctree}}\n:hidden:\n:maxdepth: 1\n\n{contents}\n```\n"
     (REFERENCE / "index.md").write_text(page_text)
+
+
+def external_links() -> list[tuple[str, str]]:
+    """Return names and addresses of the repository, none without a public address."""
+    settings = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    address = settings["tool"]["foveasim"]["public-address"].rstrip("/")
+    return [("Repository", address), ("Issues", f"{address}/issues")] if address else []
+
+
+def write_home(_app: Sphinx, _config: Config) -> None:
+    """Write the pictures of the home page, and that of links to the site."""
+    for folder in ("home", "static"):
+        (RESULTS / folder).mkdir(parents=True, exist_ok=True)
+    source, moving = PICTURES / "31_moving_gaze.webp", RESULTS / "home" / "gaze.webp"
+    if moving.exists() and moving.stat().st_mtime > source.stat().st_mtime:
+        return
+    with Image.open(PICTURES / "01_first_picture.png") as opened:
+        preview = ImageOps.pad(opened.convert("RGB"), PREVIEW_PX, color="#14181d")
+    preview.save(RESULTS / "static" / "preview.png")
+    with Image.open(source) as opened:
+        shots = [
+            (frame.convert("RGB").resize(GAZE_PX), frame.info.get("duration", 160))
+            for frame in ImageSequence.Iterator(opened)
+        ]
+    images, durations_ms = zip(*shots, strict=True)
+    images[0].save(RESULTS / "home" / "gaze_still.png")
+    encoded = io.BytesIO()
+    images[0].save(
+        encoded,
+        "WEBP",
+        save_all=True,
+        append_images=images[1:],
+        duration=durations_ms,
+        loop=0,
+        quality=55,
+    )
+    moving.write_bytes(encoded.getvalue())
+
+
+def write_reference_figures(_app: Sphinx, _config: Config) -> None:
+    """Draw the figures of the reference, again when their script is newer."""
+    import reference_figures  # in this directory
+    from dark_figures import with_dark_variants
+
+    FIGURES.mkdir(parents=True, exist_ok=True)
+    changed = Path(reference_figures.__file__).stat().st_mtime
+    with with_dark_variants():
+        for name, draw in reference_figures.figures():
+            path = FIGURES / f"{name}.png"
+            if not path.exists() or path.stat().st_mtime < changed:
+                foveasim.view.save_figure(draw(), path, dpi=110)
+
+
+def dotted_names(source: str) -> set[str]:
+    """Return the complete names of everything that a script takes from foveasim."""
+    tree = ast.parse(source)
+    known: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            module = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
+            for name in node.names:
+                if f"{module}{name.name}".startswith("foveasim"):
+                    known[name.asname or name.name] = f"{module}{name.name}"
+    for node in ast.walk(tree):  # make = fs.layout
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            target = chain_of(node.value)
+            if target and target[0] in known:
+                known[node.targets[0].id] = ".".join((known[target[0]], *target[1:]))
+    chains = [chain_of(node) for node in ast.walk(tree)]
+    return {
+        ".".join((known[chain[0]], *chain[1:]))
+        for chain in chains
+        if chain and chain[0] in known
+    }
+
+
+def chain_of(node: ast.AST) -> tuple[str, ...]:
+    """Return the names of ``a.b.c``, or none for other expressions."""
+    if isinstance(node, ast.Name):
+        return (node.id,)
+    if isinstance(node, ast.Attribute) and chain_of(node.value):
+        return (*chain_of(node.value), node.attr)
+    return ()
+
+
+def examples_of_names() -> dict[str, list[str]]:
+    """Map the names that have a page to the pages of the gallery that use them."""
+    homes = {}
+    for module, names in public_names().items():
+        for n in names:
+            homes[id(getattr(importlib.import_module(module), n))] = f"{module}.{n}"
+    found: dict[str, list[str]] = {}
+    for script in gallery_scripts(REPOSITORY):
+        used = set()
+        for name in dotted_names(script.read_text()):
+            value: Any = foveasim
+            with suppress(AttributeError, ImportError):  # methods; PyTorch
+                for part in name.split(".")[1:]:
+                    value = getattr(value, part)
+                    used.add(homes.get(id(value)))
+        for name in used - {None}:
+            found.setdefault(name, []).append(script.stem)
+    return found
 
 
 def write_layouts(_app: Sphinx, _config: Config) -> None:

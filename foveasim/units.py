@@ -32,9 +32,13 @@ __all__ = [
     "w_from_w_m2_um2",
 ]
 
+#: Planck constant.
 PLANCK_J_S = 6.62607015e-34
+#: Speed of light in vacuum.
 LIGHT_SPEED_M_PER_S = 299_792_458.0
+#: Charge of an electron, without its sign.
 ELEMENTARY_CHARGE_C = 1.602176634e-19
+#: Boltzmann constant.
 BOLTZMANN_J_PER_K = 1.380649e-23
 
 

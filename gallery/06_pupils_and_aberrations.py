@@ -44,7 +44,11 @@ MARECHAL_WAVES = 1.0 / 14.0
 QUICK = {"n_frequencies": 30}
 
 
-def half_moon(x: np.ndarray, y: np.ndarray, wavelength_nm: float) -> np.ndarray:  # noqa: ARG001 -- signature of pupil functions
+def half_moon(
+    x: np.ndarray,
+    y: np.ndarray,
+    wavelength_nm: float,  # noqa: ARG001 -- signature of pupil functions
+) -> np.ndarray:
     """Return the transmission of a pupil: the upper half, decreasing in x."""
     return (y > 0.0) * (1.0 - 0.4 * (1.0 + x))
 

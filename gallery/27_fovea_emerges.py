@@ -270,7 +270,7 @@ class Reader(nn.Module):
         sd = (electrons + READ_NOISE_E**2).sqrt()
         electrons = electrons + sd * torch.randn(electrons.shape, generator=random)
         area_um2 = self.mesh.outlines.area_um2(points).float()
-        return self.network(4.0 * electrons / (ELECTRONS_PER_UM2 * area_um2) - 1.0)  # type: ignore[no-any-return]
+        return self.network(4.0 * electrons / (ELECTRONS_PER_UM2 * area_um2) - 1.0)
 
 
 def train(

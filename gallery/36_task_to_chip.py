@@ -248,7 +248,7 @@ class Reader(nn.Module):
     def forward(self, values: Tensor) -> Tensor:
         """Return scores (n, 10) of readings (n, n_site)."""
         found = self.features(values[:, None])
-        return self.classify(torch.cat((found.amax(dim=2), found.mean(dim=2)), dim=1))  # type: ignore[no-any-return]
+        return self.classify(torch.cat((found.amax(dim=2), found.mean(dim=2)), dim=1))
 
 
 def fit(reader: Reader, layer: SensorLayer, n_steps: int, seed: int) -> Reader:
@@ -434,7 +434,7 @@ def draw_accuracies(
 
 def deviation(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Compute the sample standard deviation along the first axis; 0 for one value."""
-    return values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1:])  # type: ignore[no-any-return]
+    return values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1:])
 
 
 def compare(

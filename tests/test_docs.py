@@ -12,9 +12,11 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import yaml
 from PIL import Image
 from registries import restored
 
+import foveasim
 from foveasim._core.registry import Registry
 from foveasim.sensor import Sensor
 
@@ -23,7 +25,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 #: Targets of links and pictures, without URLs and sections of the same page.
 TARGET = re.compile(r"\]\((?![a-z]+:)([^)#\s]+)")
 #: Directories that the build writes.
-GENERATED = {"_build", "gallery", "layouts", "reference"}
+GENERATED = {"_build", "gallery", "layouts", "reference", "results"}
 
 
 def pages_of(root):
@@ -108,6 +110,16 @@ def test_code_on_a_page_runs(page, tmp_path, monkeypatch):
         exec(compile(block, str(page), "exec"), vars(main))
 
 
+def test_citation_agrees_with_its_file():
+    page = " ".join((ROOT / "docs" / "citing.md").read_text().split())
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+
+    assert page.count(cited["references"][0]["title"]) == 2  # the text and BibTeX
+    assert f"title = {{{cited['title']}}}" in page
+    assert f"version = {{{cited['version']}}}" in page
+    assert cited["version"] == foveasim.__version__
+
+
 def test_each_extension_takes_30_lines():
     pages = [ROOT / "docs" / "extending.md", *(ROOT / "docs" / "extending").glob("*.md")]
     blocks = [block for page in pages for block in BLOCK.findall(page.read_text())]
@@ -128,6 +140,38 @@ def test_tables_have_header_rows():
         wrong += [(page.stem, table) for table in tables if not re.match(r"\|.*\n\|[\s:|-]+\n", table)]
 
     assert wrong == []
+
+
+#: Columns of code for which the site has room.
+MAX_COLUMNS = 88
+FENCE = re.compile(r"^(`{3,})([^\n]*)\n(.*?)^\1 *$", re.MULTILINE | re.DOTALL)
+
+
+def lines_of_code(text):
+    """Return the lines in fenced and indented blocks of a Markdown page."""
+    fenced = [line for block in FENCE.findall(text) for line in block[2].split("\n")]
+    return fenced + [line for line in FENCE.sub("", text).split("\n") if re.match(r" {4}(?! *[*|-] )", line)]
+
+
+@pytest.mark.parametrize(
+    ("text", "n_wide"),
+    [
+        (f"```python\n{'x' * 89}\n```\n", 1),
+        (f"a\n\n    {'x' * 85}\n", 1),
+        (f"```text\n{'x' * 88}\n```\n{'x' * 120}\n", 0),
+    ],
+)
+def test_wide_lines_of_code_are_found(text, n_wide):
+    assert sum(len(line) > MAX_COLUMNS for line in lines_of_code(text)) == n_wide
+
+
+def test_lines_of_code_fit_the_pages():
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *pages_of(ROOT)]
+    wide = [(page.name, line) for page in pages for line in lines_of_code(page.read_text()) if len(line) > MAX_COLUMNS]
+    scripts = sorted((ROOT / "gallery").glob("*.py"))
+    wide += [(path.name, line) for path in scripts for line in path.read_text().split("\n") if len(line) > MAX_COLUMNS]
+
+    assert wide == []
 
 
 def test_all_pages_are_found():
@@ -209,6 +253,76 @@ def test_registries_are_described_by_their_entries(generators):
     assert set(tables) == {"LAYOUTS", "RULES"}
     assert all(len(line) > 20 and "\n" not in line for line in lines.values())
     assert generators["comment_on"]("LAYOUTS", "foveasim.layout").startswith("Layout generators by their name")
+
+
+def test_constants_are_described(generators):
+    public = generators["public_names"]()
+    comments = {
+        f"{module}.{name}": generators["comment_on"](name, module)
+        for module, names in public.items()
+        for name in generators["constants_of"](module, names)
+    }
+
+    assert {"foveasim.units.PLANCK_J_S", "foveasim.sensor.FIXED", "foveasim.optics.Pupil"} <= set(comments)
+    assert [name for name, comment in comments.items() if not comment] == []
+
+
+def test_used_names_of_a_script_are_complete(generators):
+    script = """
+import numpy as np
+import foveasim as fs
+from foveasim.view import plot_layout as draw
+make = fs.layout
+draw(make.zones(side_um=9).translate(1.0, 2.0))
+axes.grid()
+np.split(fs.Scene.from_picture("a.png"), 2)
+"""
+    names = generators["dotted_names"](script)
+
+    assert {"foveasim.layout.zones", "foveasim.view.plot_layout", "foveasim.Scene.from_picture"} <= names
+    assert not any(name.endswith(("grid", "split")) for name in names)
+
+
+@pytest.fixture
+def session(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    found = names_of("code_results.py")["Session"](str(tmp_path / "results"))
+    yield found
+    found.close()
+
+
+def test_results_are_lines_and_last_value(session):
+    printed, pictures = session.run("print('a')\nb = 3\nb + 1", "python")
+
+    assert (printed, pictures) == ("a\n4", [])
+    assert session.run("print(b)\nb = 5", "python") == ("3", [])
+
+
+def test_written_pictures_are_results(session):
+    code = "from PIL import Image\nImage.open('photo.jpg').resize((8, 4)).save('small.png')"
+    printed, pictures = session.run(code, "python")
+
+    assert printed == ""
+    assert [Image.open(picture).size for picture in pictures] == [(8, 4)]
+    assert session.run("1 + 1", "python") == ("2", [])
+
+
+def test_figures_are_results_in_light_and_dark(session, dark):
+    code = "from matplotlib.figure import Figure\nFigure(figsize=(1.0, 1.0)).add_subplot()"
+    _, (picture,) = session.run(code, "python")
+    light, inverted = (
+        Image.open(path).convert("RGB").getpixel((0, 0)) for path in (picture, dark["dark_path"](picture))
+    )
+
+    assert light == (255, 255, 255)
+    assert max(inverted) < 30
+
+
+def test_long_results_are_wrapped_and_cut(session):
+    shown = list(names_of("code_results.py")["shown_lines"]("a " * 60 + "\n" + "b\n" * 50))
+
+    assert max(map(len, shown)) <= MAX_COLUMNS
+    assert (shown.count("b"), shown[-1]) == (29, "…")
 
 
 def test_functions_of_layout_are_in_groups(generators):

@@ -58,7 +58,7 @@ SMOOTH_LAMBDA_N = 0.5
 
 class Camera:
     """
-    Optics in front of a sensor.
+    A lens and a sensor; ``capture`` exposes them to a scene.
 
     Parameters
     ----------

@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["FIXED", "TEMPORAL", "NoiseBudget", "noise_budget"]
 
-#: Standard entries of the budget: temporal noise and fixed patterns.
+#: Standard entries of the budget that are temporal noise.
 TEMPORAL = (PHOTON_SHOT, DARK_SHOT, *(effect.name for effect in STANDARD if effect.is_temporal), QUANTISATION)
+#: Standard entries of the budget that are fixed patterns.
 FIXED = tuple(effect.name for effect in STANDARD if not effect.is_temporal)
 
 
