@@ -8,7 +8,7 @@ import pytest
 import foveasim as fs
 
 #: Exposure at which most photosites of these tests are saturated.
-LONG_S = 10.0
+LONG_S = 0.3
 
 
 @pytest.fixture
@@ -102,4 +102,4 @@ def test_goal_says_what_is_saturated(recorder):
 
     assert state["errors"] == {}
     assert not found["is_present"]
-    assert found["saturated_fraction"] == pytest.approx(saturated(recorder), abs=0.02) > 0.1
+    assert found["saturated_fraction"] == saturated(recorder) > 0.1
