@@ -83,7 +83,7 @@ interface RecentFile { name: string; path: string; directory: string; time_s: nu
 interface StartContents {
   presets: StartPreset[]; generators: { name: string; label: string; text: string; fills_format: boolean; has_mosaic: boolean }[];
   formats: { name: string; label: string; size_um: number[]; source: string }[]; mosaics: { name: string; label: string }[];
-  electronics: { name: string; label: string; source: string }[]; max_sites: number; recent: RecentFile[] | null;
+  electronics: { name: string; label: string; source: string; scaling: string }[]; max_sites: number; recent: RecentFile[] | null;
   initial: { generator: string; format: string; n_sites: number; filters: string; electronics: string };
 }
 interface Busy { kind: "busy" }
@@ -105,7 +105,12 @@ interface Progress { kind: "progress"; text: string }
 interface Sought {
   kind: "sought"; id: number; key: string; label: string; unit: string; value: number; result: number; subject: string; measure: string;
   result_unit: string;
-  limits: (number | null)[]; curve: (number | null)[][];
+  limits: (number | null)[]; curve: (number | null)[][]; is_present: boolean; saturated_fraction: number;
+}
+// What a method of repair would change; without numbers if it cannot be applied.
+interface RepairPreview {
+  kind: "repair"; id: number; method: string; text: string;
+  before?: { n_sites: number; area_um2: number }; after?: { n_sites: number; area_um2: number };
 }
 interface SweepAxis { key: string; label: string; unit: string; values: number[]; is_log: boolean }
 interface SweepMessage {
@@ -120,7 +125,7 @@ interface GazePathMessage { kind: "gaze_path"; rows: [number, number, number][];
 // Times of the frames of a video that are not at equal steps.
 interface FilmTimes { kind: "film_times"; times_s: number[] | null }
 type ServerMessage = Busy | ControlsMessage | State | Done | Failure | TextMessage | Saved | Note | Progress | Exists | Sought | SweepMessage
-  | GazePathMessage | FilmTimes;
+  | GazePathMessage | FilmTimes | RepairPreview;
 
 // Binary messages: a header and arrays; as readPart returns them.
 interface PartHeader {
@@ -145,7 +150,8 @@ type Change =
   | { do: "seek"; key: string; requirement: { [name: string]: unknown } | undefined; bounds?: number[] | null }
   | { do: "solve"; name: string }
   | { do: "fit" }
-  | { do: "match" }
+  | { do: "match"; what?: "field" | "n_sites" | "both" | "data_rate" }
+  | { do: "repair"; method: "best" | "drop" | "shrink" | "merge" | "refill" }
   | { do: "apply"; variant: string }
   | { do: "preset"; name: string }
   | { do: "new_sensor"; generator: string; size_um: number[]; n_sites: number; filters?: string | null; electronics: string }
@@ -165,6 +171,7 @@ type Change =
   | { do: "unfreeze" }
   | { do: "variant"; action: "keep" | "update" | "describe" | "delete"; variant?: string; name?: string; note?: string }
   | { do: "compare"; variants: string[] }
+  | { do: "preview_repairs" }
   | { do: "sweep"; settings: { key: string; [name: string]: unknown }[] | undefined; results: { [name: string]: unknown }[] | undefined }
   | { do: "stop_sweep" }
   | { do: "sweep_file" }

@@ -103,6 +103,7 @@ def foveal_against_square(page: Page) -> None:
     choose(page, "layout", "grid")
     put(page, "layout.parameters.n_x", "170")
     put(page, "layout.parameters.n_y", "170")
+    page.select_option("#match-what", "both")
     page.click("#match")
     wait_for_views(page)
 
@@ -136,6 +137,7 @@ def chip(page: Page, directory: Path) -> Path:
     page.keyboard.press("Enter")
     wait_for_views(page)
     page.click("[data-tool=repair]")
+    page.click(".repairs li[data-method=best]:not(.pending) button")
     wait_for_views(page)
     return download(page, "gds", directory / "sensor.gds")
 

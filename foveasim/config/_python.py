@@ -35,6 +35,7 @@ LINE_LENGTH = 100
 #: Names of pictures of scikit-image.
 BUNDLED = re.compile(r"skimage:[\w-]+")
 INDENT = "    "
+CHECK = "report = camera.layout.check(rules)"
 HEADER = '"""Simulation of a shot; written by foveasim."""\n'
 
 
@@ -53,8 +54,8 @@ def to_python(settings: Mapping[str, Any], *, source: Source | str | Path | None
     Returns
     -------
     text : str
-        Source that defines ``camera``, ``scene`` and ``capture``; with a gaze path also ``gaze_path``, and ``video``, which
-        yields a capture for each of its rows.
+        Source that defines ``camera``, ``scene`` and ``capture``; with design rules also ``rules`` and their ``report``; with a
+        gaze path also ``gaze_path``, and ``video``, which yields a capture for each of its rows.
 
     Raises
     ------
@@ -85,6 +86,8 @@ def to_python(settings: Mapping[str, Any], *, source: Source | str | Path | None
             "camera, scene = shot.camera, shot.scene",
             "capture = camera.capture(scene, exposure_s=shot.requested_s, seed=shot.seed)",
         ]
+        if getattr(shot.layout, "rules", None) is not None:
+            lines += ["rules = shot.rules", CHECK]
         if shot.gaze_path is not None:
             lines += ["gaze_path = shot.gaze_path", _video_line(writer, _Name("shot.requested_s"), _Name("shot.seed"))]
     imports = ["import foveasim as fs", *sorted(writer.imports)]
@@ -114,6 +117,7 @@ def _shot_lines(writer: _Writer, shot: Any) -> list[str]:
         f"camera = {writer.call('fs.Camera', camera)}",
         writer.assignment("scene", shot.scene),
         f"capture = {writer.call('camera.capture', capture, positional=('scene',))}",
+        *([] if getattr(shot.layout, "rules", None) is None else [CHECK]),
         *_gaze_lines(writer, shot),
     ]
 
@@ -153,6 +157,10 @@ def _layout_lines(writer: _Writer, section: Any, variable: str = "layout") -> li
         first = {} if call.startswith(f"{variable}.") else {"layout": layout}
         return f"{layout} = {writer.call(call, {**first, **values}, positional=('layout',))}"
 
+    rules = section.rules
+    if rules is not None and variable == "layout":
+        lines.append(writer.assignment("rules", rules))
+        rules = _Name("rules")
     if section.mosaic is not None:
         lines.append(step("fs.layout.mosaic", {"block": section.mosaic}))
     for edit in getattr(section, "edits", []):
@@ -161,8 +169,8 @@ def _layout_lines(writer: _Writer, section: Any, variable: str = "layout") -> li
             lines += _layout_lines(writer, values["layer"], "layer")
             values["layer"] = _Name("layer")
         call = call_of(edit)
-        if values.get("rules") is None and "rules" in type(edit).model_fields and section.rules is not None:
-            values["rules"] = section.rules
+        if values.get("rules") is None and "rules" in type(edit).model_fields and rules is not None:
+            values["rules"] = rules
         assert call is not None
         is_method = inspect.unwrap(getattr(Layout, call.__name__, len)) is inspect.unwrap(call)
         lines.append(step(f"{variable}.{call.__name__}" if is_method else writer.name_of(call), values))
@@ -245,9 +253,7 @@ class _Writer:
             found = import_module(module)
             for name in found.__all__:
                 if name == getattr(wanted, "__name__", "") and inspect.unwrap(getattr(found, name)) is wanted:
-                    if shown.count(".") > 1:
-                        self.imports.add(f"import {module}")
-                    return f"{module if shown.count('.') > 1 else shown}.{name}"
+                    return f"{shown}.{name}"
         if "<" in wanted.__qualname__ or "." in wanted.__qualname__:
             raise _NotPublicError
         self.imports.add(f"import {wanted.__module__}")

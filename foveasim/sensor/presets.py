@@ -50,6 +50,16 @@ class Preset:
     def __repr__(self) -> str:
         return f"Preset({self.title!r})"
 
+    @property
+    def scaling(self) -> str:
+        """Sentence about what depends on the area of a site."""
+        if not self.per_um2:
+            return "All parameters are equal for sites of any size."
+        return (
+            "Full well, capacitance and the steps of the ADC in electrons are proportional to the area of a site; read noise "
+            "and bits are those of the pixel."
+        )
+
     def values(self, area_um2: Floats) -> dict[str, Any]:
         """Return the parameters of a sensor whose sites have these areas, (n_site,)."""
         return {**self.parameters, **{name: value * area_um2 for name, value in self.per_um2.items()}}

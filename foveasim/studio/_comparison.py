@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ from foveasim.fields import Grid, PowerMap
 from foveasim.layout import Layout
 from foveasim.scene import Scene
 from foveasim.studio._engine import Simulated
-from foveasim.studio._settings.unknowns import is_generated
+from foveasim.studio._settings.unknowns import is_generated, size_of
 
 #: Side of the compared pictures, pixels.
 N_PIXELS = 160
@@ -24,20 +25,25 @@ FOVEA_FRACTION = 0.2
 #: Sites of the fovea have at most this multiple of the area of the smallest ones, without the smallest 1 %, often slivers.
 FOVEA_AREA_RATIO, SLIVER_QUANTILE = 2.0, 0.01
 MM2_PER_UM2 = 1e-6
-#: Rows of the comparison: label and unit by name.
+#: Rows of the comparison: label, unit, and which values are better, by name.
 ROWS = {
-    "n_sites": ("photosites", ""),
-    "bits_per_frame": ("bits per frame", ""),
-    "frames_per_s": ("frame rate", "1/s"),
-    "readout_steps": ("longest line", "sites"),
-    "area_mm2": ("area", "mm²"),
-    "total_e": ("electrons", "e-"),
-    "read_noise_e": ("read noise", "e-"),
-    "fovea_psnr_db": ("PSNR, fovea", "dB"),
-    "field_psnr_db": ("PSNR, field", "dB"),
-    "fovea_ssim": ("SSIM, fovea", ""),
-    "field_ssim": ("SSIM, field", ""),
+    "n_sites": ("photosites", "", None),
+    "bits_per_frame": ("bits per frame", "", None),
+    "frames_per_s": ("frame rate", "1/s", "high"),
+    "readout_steps": ("longest line", "sites", "low"),
+    "area_mm2": ("area", "mm²", None),
+    "median_e": ("median signal of a site", "e-", None),
+    "saturated_percent": ("saturated sites", "%", "low"),
+    "read_noise_e": ("median read noise of a site", "e-", "low"),
+    "fovea_psnr_db": ("PSNR, fovea", "dB", "high"),
+    "field_psnr_db": ("PSNR, field", "dB", "high"),
+    "fovea_ssim": ("SSIM, fovea", "", "high"),
+    "field_ssim": ("SSIM, field", "", "high"),
 }
+#: Relative difference of widths and heights up to which fields are equal; also the size of a median photosite.
+SAME_FIELD = 0.01
+#: Relative difference up to which no value is better.
+SAME_VALUE = 1e-3
 
 
 def compare(variants: Sequence[tuple[str, Simulated]]) -> dict[str, Any]:
@@ -51,8 +57,8 @@ def compare(variants: Sequence[tuple[str, Simulated]]) -> dict[str, Any]:
     Returns
     -------
     about : dict
-        Names; rows with the name, label, unit and the values of all variants; sides of the squares, µm; whether the last
-        variant can have another number of photosites.
+        Names; rows with the name, label, unit, the values of all variants and the indices of the better ones; sides of the
+        squares, µm; width and height of each field, µm, and whether they are equal; whether the last variant can match others.
     """
     last = variants[-1][1]
     half_um = min(_half_side_um(result.capture.layout) for _, result in variants)
@@ -66,17 +72,32 @@ def compare(variants: Sequence[tuple[str, Simulated]]) -> dict[str, Any]:
     found = [
         _measures(*one, rate_bit_per_s, half_um) for one in zip((result for _, result in variants), framed, strict=True)
     ]
+    values = {name: [each[name] for each in found] for name in ROWS}
     rows = [
-        {"name": name, "label": label, "unit": unit, "values": [each[name] for each in found]}
-        for name, (label, unit) in ROWS.items()
+        {"name": name, "label": label, "unit": unit, "values": values[name], "best": _best(values[name], better)}
+        for name, (label, unit, better) in ROWS.items()
     ]
+    layouts = [result.capture.layout for _, result in variants]
+    sizes_um = np.array([size_of(layout) for layout in layouts])
+    tolerance_um = np.maximum(SAME_FIELD * sizes_um.max(axis=0), max(np.median(layout.size_um) for layout in layouts))
     return {
         "names": [name for name, _ in variants],
         "rows": rows,
         "field_um": 2.0 * half_um,
         "fovea_um": 2.0 * FOVEA_FRACTION * half_um,
+        "sizes_um": sizes_um.tolist(),
+        "has_equal_fields": bool((np.ptp(sizes_um, axis=0) <= tolerance_um).all()),
         "can_match": is_generated(last.settings),
     }
+
+
+def _best(values: Sequence[float | None], better: str | None) -> list[int]:
+    """Return the indices of the best values; none where all are about equal, or none is better."""
+    known = [value for value in values if value is not None and not np.isnan(value)]
+    if better is None or not known or math.isclose(min(known), max(known), rel_tol=SAME_VALUE):
+        return []
+    best = max(known) if better == "high" else min(known)
+    return [k for k, value in enumerate(values) if value == best]
 
 
 def _frame_rate(result: Simulated) -> float | None:
@@ -120,8 +141,9 @@ def _measures(
         "frames_per_s": rate_bit_per_s and rate_bit_per_s / budget.data_rate_bit_per_s,
         "readout_steps": budget.readout_steps,
         "area_mm2": budget.area_um2 * MM2_PER_UM2,
-        "total_e": float(result.capture.electrons.sum(dtype=np.float64)),
-        "read_noise_e": float(np.sqrt(budget.read_noise_e2)),
+        "median_e": float(np.median(result.capture.electrons)),
+        "saturated_percent": 100.0 * result.capture.saturated_fraction,
+        "read_noise_e": result.read_noise_e,
     }
     (scene, capture), camera, centre_um = framed, result.shot.camera, fovea_um(result.capture.layout)
     for name, side_um in (("field", half_um), ("fovea", FOVEA_FRACTION * half_um)):
@@ -145,8 +167,7 @@ def fovea_um(layout: Layout) -> Floats:
 
 def _half_side_um(layout: Layout) -> float:
     """Return half the shorter side of the bounding box."""
-    x0_um, y0_um, x1_um, y1_um = layout.bounds_um
-    return 0.5 * min(x1_um - x0_um, y1_um - y0_um)
+    return 0.5 * min(size_of(layout))
 
 
 def _square(centre_um: Floats, half_um: float) -> Grid:

@@ -19,6 +19,7 @@ from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import GeometryError
 from foveasim.explore.worker_cache import ShotRunner
+from foveasim.layout import Layout
 from foveasim.scene import Scene
 
 #: Longer side of pictures where the page gives none.
@@ -73,6 +74,11 @@ class Simulated:
 
     __repr__ = short_repr
 
+    @property
+    def read_noise_e(self) -> float:
+        """Median noise of the readout over the photosites, without quantisation, e-."""
+        return float(np.sqrt(np.median(self.shot.camera.sensor.readout_model(0.0).noise_e2)))
+
 
 class Engine:
     """
@@ -106,6 +112,15 @@ class Engine:
     def clear(self) -> None:
         """Remove all cached stages."""
         self._runner.cache.clear()
+
+    def layout(self, settings: Mapping[str, Any]) -> Layout:
+        """Return the layout of settings, which the simulation that follows finds in the cache."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                return self._runner.build_shot(settings).camera.layout
+            finally:
+                self._runner.cache.finish_point()
 
     def simulate(self, settings: Mapping[str, Any], *, is_preview: bool = False) -> Simulated:
         """

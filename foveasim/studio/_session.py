@@ -15,7 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import foveasim.studio._settings.goal  # handles messages, as the next
+import foveasim.studio._settings.goal  # handles messages, as the next ones
+import foveasim.studio._settings.repairs
 import foveasim.studio._start.new_sensor  # noqa: F401
 from foveasim._core.work_arrays import release_memory
 from foveasim.config import check_settings

@@ -363,10 +363,12 @@ def test_rules_follow_drag_and_repair(edit):
     settle(page)
     assert page.evaluate("studio.rules.violations.n") > 0
     use(page, "repair")
+    until(page, "() => document.querySelector('.repairs li[data-method=drop]:not(.pending)')")
+    page.click(".repairs li[data-method=drop] button")
     settle(page)
 
     until(page, "() => document.querySelector('.rules-button').textContent === 'rules satisfied'")
-    assert edits(page)[-1] == {"kind": "repair"}
+    assert edits(page)[-1] == {"kind": "repair", "method": "drop"}
 
 
 # -- history, steps -----------------------------------------------------------------------------------------------------------

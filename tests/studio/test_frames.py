@@ -302,13 +302,15 @@ def test_comparison_has_closed_form_budgets(recorder):
     assert found["frames_per_s"] == pytest.approx([160.0, 100.0])
     assert found["area_mm2"] == pytest.approx([224 * 144e-6, 448 * 144e-6])
     assert found["readout_steps"] == [14, 14]
-    assert found["read_noise_e"] == pytest.approx([2.0 * 224**0.5, 2.0 * 448**0.5])
+    # Of a site, whatever their number.
+    assert found["read_noise_e"] == pytest.approx([2.0, 2.0])
+    assert found["median_e"][1] == np.median(recorder.session.result.capture.electrons)
 
 
 def test_match_solves_for_the_budget_of_a(recorder):
     recorder.do(do="freeze", id=1)
     recorder.do(do="set", key="layout.parameters", value={"n_x": 30, "n_y": 30, "pitch_um": 6.0}, id=2)
-    state = recorder.do(do="match", id=3)
+    state = recorder.do(do="match", what="n_sites", id=3)
     found = table(recorder)
 
     assert state["errors"] == {}
@@ -319,6 +321,65 @@ def test_match_solves_for_the_budget_of_a(recorder):
     recorder.do(do="unfreeze", id=5)
     assert table(recorder) is None
     assert "no variant A" in recorder.do(do="match", id=6)["errors"]["match"]
+
+
+def comparison(recorder):
+    return next(header["about"] for header, _ in recorder.parts if header["part"] == "comparison")
+
+
+@pytest.mark.parametrize(
+    ("generator", "parameters", "what"),
+    [
+        ("grid", {"n_x": 30, "n_y": 20, "pitch_um": 3.0}, "field"),
+        ("grid", {"n_x": 30, "n_y": 20, "pitch_um": 3.0}, "both"),
+        ("sunflower", {"n_sites": 300, "spacing_um": 5.0}, "field"),
+        ("sunflower", {"n_sites": 300, "spacing_um": 5.0}, "both"),
+        ("log_polar", {"n_sectors": 32, "min_size_um": 4.0, "r_max_um": 150.0}, "field"),
+    ],
+)
+def test_match_gives_the_field_of_a(recorder, generator, parameters, what):
+    """A is a grid of 16 x 14 sites of 12 µm; layouts that do not fill a rectangle are inscribed in it."""
+    recorder.do(do="set", key="sensor.filters", value=None)
+    recorder.do(do="freeze")
+    recorder.do(do="set", key="layout", value={"generator": generator, "parameters": parameters})
+    before = recorder.session.result.capture.layout.n_sites
+    assert not comparison(recorder)["has_equal_fields"]
+    state = recorder.do(do="match", **({"what": what} if what != "field" else {}))
+    x0_um, y0_um, x1_um, y1_um = recorder.session.result.capture.layout.bounds_um
+
+    assert state["errors"] == {}
+    expected_um = (192.0, 168.0) if generator == "grid" else (168.0, 168.0)
+    # Numbers of rows and rings are integers.
+    assert (x1_um - x0_um, y1_um - y0_um) == pytest.approx(expected_um, rel=0.06)
+    assert (x1_um - x0_um) <= expected_um[0] * (1.0 + 1e-9)
+    assert state["summary"]["n_sites"] == pytest.approx(before if what == "field" else 224, rel=0.04)
+    assert comparison(recorder)["has_equal_fields"] == (generator == "grid")
+
+
+def test_match_gives_the_data_rate_of_a(recorder):
+    recorder.do(do="freeze")
+    recorder.do(do="set", key="sensor.bits", value=5)
+    recorder.do(do="match", what="data_rate")
+
+    # Twice as many sites of half the bits.
+    assert table(recorder)["bits_per_frame"] == pytest.approx([2240, 2240], rel=0.05)
+
+
+def test_better_values_are_marked(recorder):
+    recorder.do(do="freeze")
+    recorder.do(do="set", key="sensor.read_noise_e", value=30.0)
+    best = {row["name"]: row["best"] for row in comparison(recorder)["rows"]}
+
+    assert best["read_noise_e"] == [0]
+    assert best["n_sites"] == best["area_mm2"] == best["readout_steps"] == []
+
+
+def test_comparison_shows_saturation(recorder):
+    recorder.do(do="freeze")
+    recorder.do(do="set", key="exposure_s", value=10.0)
+    code = recorder.session.result.capture.code
+
+    assert table(recorder)["saturated_percent"][1] == 100.0 * np.mean(code == 1023) > 10.0
 
 
 @pytest.mark.parametrize(

@@ -409,16 +409,25 @@ def test_match_gives_the_same_number_of_sites(visit):
     until(page, "() => studio.isIdle && studio.state.settings.layout.generator === 'grid'")
     until(page, "() => document.querySelectorAll('#comparison tr.differs').length > 5")
     before = rows(page)
-    assert before["n_sites"] == ["912", "14,400"]
+    assert before["n_sites"] == ["912", "14,400", "+13,490"]
+    page.select_option("#match-what", "n_sites")
     page.click("#match")
     until(page, "() => studio.isIdle && studio.panes.b.sites.n < 2000")
     after = rows(page)
 
-    assert after["n_sites"] == ["912", "900"]
+    assert after["n_sites"] == ["912", "900", "−12"]
     assert page.evaluate("studio.state.summary.width_um") == pytest.approx(960.0, rel=1e-6)
     assert all(
-        value.endswith(" dB") and float(value[:-3]) > 5 for value in after["fovea_psnr_db"] + after["field_psnr_db"]
+        value.endswith(" dB") and float(value[:-3]) > 5
+        for value in after["fovea_psnr_db"][:2] + after["field_psnr_db"][:2]
     )
+    assert page.locator("#comparison tr[data-name=fovea_psnr_db] th").inner_text() == "PSNR, fovea (fields differ)"
+    assert "The fields differ: A 1,377 × 1,377 µm, B 960 × 960 µm" in page.inner_text("#comparison-note")
+    page.select_option("#match-what", "field")
+    page.click("#match")
+    until(page, "() => studio.isIdle && studio.state.summary.width_um > 1300")
+    assert page.evaluate("studio.state.summary.width_um") == pytest.approx(1377.3, rel=1e-3)
+    until(page, "() => document.getElementById('comparison-note').textContent === ''")
     page.click("#freeze")
     assert page.is_hidden("#comparison")
 
@@ -428,10 +437,10 @@ def test_equal_variants_have_equal_rows(visit):
     page.click("#freeze")
     found = rows(page)
 
-    assert all(a == b for a, b in found.values())
-    assert found["bits_per_frame"] == ["9,120", "9,120"]
-    assert found["frames_per_s"] == ["50 1/s", "50 1/s"]
-    assert page.is_disabled("#match")
+    assert all(a == b and difference == "0" for a, b, difference in found.values())
+    assert found["bits_per_frame"] == ["9,120", "9,120", "0"]
+    assert found["frames_per_s"] == ["50 1/s", "50 1/s", "0"]
+    assert page.locator("#comparison .best").count() == 0
 
 
 # -- notebook, archive, links ---------------------------------------------------------------------------------------------------

@@ -76,6 +76,18 @@ def test_template_fills_its_format(recorder, generator, n_sites):
     assert max(-x0_um, x1_um) <= 0.5 * expected_um[0] * (1.0 + 1e-9)
 
 
+@pytest.mark.slow(keep=1)
+@pytest.mark.parametrize("fovea", ["rings", "linear", "hexagons"])
+@pytest.mark.parametrize("generator", ["log_polar", "giotto"])
+def test_filled_fovea_stays_in_the_format(recorder, generator, fovea):
+    create(recorder, generator=generator, n_sites=3000, filters=None)
+    state = recorder.do(do="set", key="layout.parameters.fovea", value=fovea)
+
+    assert state["errors"] == {}
+    for side_um in (state["summary"]["width_um"], state["summary"]["height_um"]):
+        assert 0.9 * 3600.0 <= side_um <= 3600.0 * (1.0 + 1e-9)
+
+
 @pytest.mark.slow
 def test_new_sensor_is_one_step(recorder, settings):
     create(recorder, generator="sunflower")

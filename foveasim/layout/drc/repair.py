@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import shapely
 
+from foveasim._core.quantities import format_quantity
 from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Bools, Ints
 from foveasim.errors import GeometryError, ParameterError
@@ -111,7 +112,7 @@ class Changes(Sequence[Change]):
     >>> import foveasim as fs
     >>> rings = fs.layout.log_polar(n_sectors=32, r_min_um=2.0, r_max_um=50.0)
     >>> print(rings.enforce(fs.DesignRules(min_size_um=1.0))[1])
-    512 -> 389 sites, area 6741.5 -> 6741.5 µm² (100 %), smallest site 0.434 -> 1.01 µm
+    512 -> 389 sites, area 6,741.5 µm² -> 6,741.5 µm² (100 %), smallest site 0.434 -> 1.01 µm
     min_size_um: 192 sites merged
     """
 
@@ -133,9 +134,10 @@ class Changes(Sequence[Change]):
     def __str__(self) -> str:
         before, after = self.before, self.after
         kept = f" ({100.0 * after.area_um2 / before.area_um2:.4g} %)" if before.area_um2 else ""
+        area = " -> ".join(format_quantity(stock.area_um2, "µm²", digits=5) for stock in (before, after))
         lines = [
             (
-                f"{before.n_sites:,} -> {after.n_sites:,} sites, area {before.area_um2:.5g} -> {after.area_um2:.5g} µm²{kept}, "
+                f"{before.n_sites:,} -> {after.n_sites:,} sites, area {area}{kept}, "
                 f"smallest site {before.min_size_um:.3g} -> {after.min_size_um:.3g} µm"
             )
         ]
@@ -215,7 +217,7 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "best") -> t
 @layout_edit(example={"rules": DesignRules(min_size_um=5.0)})
 def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair = "best") -> Layout:
     """
-    Return a layout repaired to satisfy the rules.
+    Return a layout repaired to satisfy the rules, with a record of the repair in its provenance.
 
     Parameters
     ----------
@@ -224,6 +226,12 @@ def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair =
         Required in Python. In settings files, those of the layout by default.
     method : {"best", "drop", "shrink", "merge", "refill"}
         As ``repair`` of :func:`enforce`.
+
+    Returns
+    -------
+    Layout
+        ``provenance["repairs"]`` has an entry for each repair: the method, the number of sites, the area and the smallest site
+        before and after, and the text of its :class:`Changes`.
 
     Raises
     ------
@@ -241,7 +249,14 @@ def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair =
     """
     if rules is None:
         raise ParameterError("rules", "must be given", hint="in settings files, the layout may have them")
-    return enforce(layout, rules, repair=method)[0]
+    found, changes = enforce(layout, rules, repair=method)
+    record = {
+        "method": method,
+        "before": asdict(changes.before),
+        "after": asdict(changes.after),
+        "text": str(changes),
+    }
+    return found.with_provenance({**found.provenance, "repairs": [*layout.provenance.get("repairs", []), record]})
 
 
 def _drop_violating_sites(

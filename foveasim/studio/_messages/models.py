@@ -13,6 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr,
 from pydantic.json_schema import SkipJsonSchema
 
 from foveasim.errors import ParameterError, printable
+from foveasim.layout.drc.repair import Repair
 from foveasim.studio._engine import MAX_SITES
 from foveasim.studio._messages.encoding import from_json
 
@@ -241,7 +242,15 @@ class FitScene(Change, do="fit"):
 
 
 class MatchBudget(Change, do="match"):
-    """Change the number of photosites to that of A."""
+    """Change the field of the generator, its number of photosites, or both, to those of A."""
+
+    what: Literal["field", "n_sites", "both", "data_rate"] = _must_be("field, n_sites, both or data_rate", "field")
+
+
+class RepairLayout(Change, do="repair", is_once=True):
+    """Repair the layout by a method of :func:`foveasim.layout.enforce`, as its last edit."""
+
+    method: Repair = _must_be("best, drop, shrink, merge or refill")
 
 
 class ApplyVariant(Change, do="apply"):
@@ -411,6 +420,10 @@ class SweptSetting(BaseModel):
     model_config = ConfigDict(extra="allow")
 
     key: Key
+
+
+class PreviewRepairs(Message, do="preview_repairs"):
+    """Send what each method of repair would change."""
 
 
 class StartSweep(Message, do="sweep", ends_points=True):

@@ -7,7 +7,7 @@ import numpy as np
 from foveasim._core.validation import Floats
 from foveasim.sensor import noise_budget
 from foveasim.studio._engine import Simulated
-from foveasim.studio._parts.registry import PartData, capture_of, part
+from foveasim.studio._parts.registry import PartData, capture_of, part, saturation_of
 
 
 @part("Noise", capture_of, order=40, is_first=True)
@@ -20,7 +20,14 @@ def noise(result: Simulated) -> PartData:
         for name, values in budget.items()
         if (found := _median(values)) > 0.0
     ]
-    return {"sources": sources, "unit": "e-", "median_electrons": float(np.median(capture.electrons))}, {}
+    return {
+        "sources": sources,
+        "unit": "e-",
+        "median_electrons": float(np.median(capture.electrons)),
+        "saturation": saturation_of(result),
+        "is_coarse": _median(budget["quantisation"]) > result.read_noise_e > 0.0,
+        "read_e": result.read_noise_e,
+    }, {}
 
 
 def _median(values: Floats) -> float:

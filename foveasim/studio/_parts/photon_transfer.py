@@ -10,7 +10,7 @@ from foveasim._core.validation import Floats
 from foveasim.sensor import NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise
 from foveasim.studio._engine import Simulated
-from foveasim.studio._parts.registry import PartData, curves_of, label_of, part, pinned_of
+from foveasim.studio._parts.registry import PartData, curves_of, label_of, part, pinned_of, saturation_of
 
 #: Number of levels of a curve.
 N_LEVELS = 129
@@ -49,7 +49,7 @@ def photon_transfer(result: Simulated) -> PartData:
     about["marks"] = [{"x": x, "y": y}] if min(x, y) > 0.0 and curves else []
     about["note"] = (
         f"Photosite {site:,}, {float(now.gain_dn_per_e.flat[0]):.3g} DN/e-, full range {full_range_e(copies):,.0f} e-"
-        f"{'; now saturated' if now.is_saturated[0] else ''}"
+        f"{'; now saturated' if now.is_saturated[0] else ''}{saturation_of(result)}"
     )
     return about, arrays
 
@@ -80,7 +80,7 @@ def _pinned_curves(result: Simulated) -> PartData:
         notes.append(f"{site:,}: full range {full_range_e(copies):,.0f} e-")
     labels = [label_of(site) for site in result.pinned]
     about, arrays = curves_of([{"label": n, "name": n, "unit_x": "e-", "unit_y": "e-"} for n in labels], x, y)
-    return about | {"marks": marks, "note": "; ".join(notes)}, arrays
+    return about | {"marks": marks, "note": "; ".join(notes) + saturation_of(result)}, arrays
 
 
 def _root_sum_of_squares(budget: NoiseBudget, names: list[str]) -> Floats:

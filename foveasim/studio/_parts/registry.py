@@ -24,6 +24,7 @@ __all__ = [
     "page_part",
     "part",
     "pinned_of",
+    "saturation_of",
 ]
 
 #: Order of the first view in a tile.
@@ -146,6 +147,12 @@ def label_of(site: int) -> str:
 def layout_of(result: Simulated) -> tuple[Any, ...]:
     """Return the dependencies of views of a layout."""
     return (result.capture.layout,)
+
+
+def saturation_of(result: Simulated) -> str:
+    """Return the fraction of saturated photosites as the end of a note; empty if none is."""
+    fraction = result.capture.saturated_fraction
+    return f"; {100.0 * fraction:.3g} % of the photosites are saturated" if fraction else ""
 
 
 def curves_of(curves: list[dict[str, Any]], x: Sequence[NDArray[Any]], y: Sequence[NDArray[Any]]) -> PartData:

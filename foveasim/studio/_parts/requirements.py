@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+from foveasim.config import Requirement
 from foveasim.errors import FoveasimError
 from foveasim.explore import CheckedRequirement, result_of
 from foveasim.metrics import METRICS, metric_info
 from foveasim.metrics.registry import has_region
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, part
+
+#: Results that saturated photosites falsify.
+OF_SIGNALS = ("mean_code_dn", "psnr_db", "ssim", "snr", "snr_db", "snr_mean_db")
+
+
+def saturated_fraction(requirement: Requirement, result: Simulated) -> float:
+    """Return the fraction of saturated photosites among those of a requirement on signals; 0 for others."""
+    if requirement.measure not in OF_SIGNALS:
+        return 0.0
+    return result_of(replace(requirement, measure="saturated_fraction"), result.shot, result.capture)
 
 
 @part("Requirements", lambda result: (result.capture, result.shot.requirements), order=95)
@@ -24,6 +36,7 @@ def requirements(result: Simulated) -> PartData:
             row |= {"value": None, "margin": None, "is_met": False, "problem": str(error)}
         else:
             row |= {"value": checked.value, "margin": checked.margin, "is_met": checked.is_met, "problem": ""}
+            row["saturated_fraction"] = saturated_fraction(requirement, result)
         rows.append(row)
     measures = [
         {

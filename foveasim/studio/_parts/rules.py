@@ -27,12 +27,13 @@ def _start(shot: Shot) -> None:
     work_ahead=_start,
 )
 def rules(result: Simulated) -> PartData:
-    """Return the results of the design-rule check."""
+    """Return the results of the design-rule check, and the records of repairs."""
     if result.shot.rules is None:
-        return {"rules": []}, {}
+        return {"rules": [], "repairs": []}, {}
     arrays: dict[str, NDArray[Any]] = {}
     report = _check(result.capture.layout, result.shot.rules)
-    return {"rules": rules_of(report, arrays), "is_satisfied": bool(report.ok)}, arrays
+    repairs = list(result.capture.layout.provenance.get("repairs", []))
+    return {"rules": rules_of(report, arrays), "is_satisfied": bool(report.ok), "repairs": repairs}, arrays
 
 
 _check = Ahead(Layout.check)

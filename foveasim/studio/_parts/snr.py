@@ -12,7 +12,7 @@ from foveasim.sensor import Sensor
 from foveasim.sensor.signal_to_noise import signal_to_noise
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.photon_transfer import HIGHEST, LOWEST_E, N_LEVELS, copies_of, full_range_e, median_site
-from foveasim.studio._parts.registry import PartData, curves_of, label_of, part, pinned_of
+from foveasim.studio._parts.registry import PartData, curves_of, label_of, part, pinned_of, saturation_of
 
 #: Lowest ratio in the chart, dB.
 LOWEST_DB = -10.0
@@ -46,6 +46,7 @@ def snr(result: Simulated) -> PartData:
     about["marks"] = [mark for mark in marks if mark["y"] >= LOWEST_DB]
     shown = ", ".join(f"{name} {range_db:.1f}" if len(ranges) > 1 else f"{range_db:.1f}" for name, range_db in ranges)
     about["note"] = f"Dynamic range / dB: {shown}" if ranges else "No photoelectrons"
+    about["note"] += saturation_of(result)
     about["dynamic_range_db"] = dict(ranges)
     return about, arrays
 

@@ -181,7 +181,10 @@ WORDS: dict[str, Words] = {
         "Standard deviation of the offsets of sites, over the saturation voltage.",
         synonyms="fixed pattern dsnu",
     ),
-    "preset": Words(synonyms="electronics template published"),
+    "preset": Words(
+        help="Electronics of a published sensor. Full well and steps of the ADC follow the area of each site.",
+        synonyms="electronics template published",
+    ),
     "prnu_fraction": Words("PRNU", synonyms="fixed pattern non-uniformity"),
     "psfs": Words(
         "PSFs", "Point spread functions of a lens design, from a file.", synonyms="point spread zemax aberrations"

@@ -13,6 +13,7 @@ import numpy as np
 
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.layout import LAYOUTS, Layout
+from foveasim.layout.generator_fields import RECTANGULAR, with_field
 from foveasim.studio._messages.models import MatchBudget, SolveFor, handles
 
 if TYPE_CHECKING:
@@ -324,12 +325,31 @@ def _solve_for(session: Session, message: SolveFor) -> dict[str, Any]:
     return with_unknown(session.history.settings, message.name, generated)
 
 
+def size_of(layout: Layout) -> tuple[float, float]:
+    """Return width and height of the bounding box, µm."""
+    x0_um, y0_um, x1_um, y1_um = layout.bounds_um
+    return x1_um - x0_um, y1_um - y0_um
+
+
 @handles(MatchBudget)
-def _match_budget(session: Session, _message: MatchBudget) -> dict[str, Any]:
-    settings, frozen = session.history.settings, session.compared.frozen_result
-    if frozen is None or session.result is None:
+def _match_budget(session: Session, message: MatchBudget) -> dict[str, Any]:
+    settings, frozen, current = session.history.settings, session.compared.frozen_result, session.result
+    if frozen is None or current is None:
         raise SimulationError("there is no variant A to compare with")
-    n_sites, edited = frozen.capture.layout.n_sites, session.result.capture.layout
-    own = session.layout_source()(settings) or edited
-    # Edits may change the number of the generator.
-    return with_n_sites(settings, max(1, round(n_sites * own.n_sites / edited.n_sites)), own)
+    target, edited, layout_of = frozen.capture, current.capture.layout, session.layout_source()
+    own = layout_of(settings) or edited
+    # Edits may change the number and the size of the generator.
+    n_sites, size_um = (
+        own.n_sites,
+        [a * g / b for a, g, b in zip(*map(size_of, (target.layout, own, edited)), strict=True)],
+    )
+    if message.what != "field":
+        factor = target.bits / current.capture.bits if message.what == "data_rate" else 1.0
+        n_sites = max(1, round(factor * target.layout.n_sites * own.n_sites / edited.n_sites))
+        settings = with_n_sites(settings, n_sites, own)
+    if message.what in ("field", "both") and is_generated(settings):
+        found, own = copy.deepcopy(settings), layout_of(settings) or own
+        generator, parameters = found["layout"]["generator"], found["layout"].get("parameters") or {}
+        found["layout"]["parameters"] = with_field(generator, parameters, size_um, size_of(own))
+        return with_n_sites(found, n_sites, own, "pitch_um", is_resized=False) if generator in RECTANGULAR else found
+    return settings

@@ -6,12 +6,13 @@ from typing import Any
 
 from foveasim._io.yaml_files import first_comment
 from foveasim.layout import LAYOUTS, MOSAICS, OPTICAL_FORMATS
+from foveasim.layout.generator_fields import RECTANGULAR
 from foveasim.layout.generator_registry import summary_of
 from foveasim.sensor import PRESETS
 from foveasim.studio._engine import MAX_SITES
 from foveasim.studio._files import Files, preset_paths, presets, thumbnail_name
 from foveasim.studio._settings.templates import has_mosaic
-from foveasim.studio._start.new_sensor import BAYER, RECTANGULAR, electronics, generators, mosaics
+from foveasim.studio._start.new_sensor import BAYER, electronics, generators, mosaics
 from foveasim.studio._start.recent import recent_files
 
 #: Initial choices of a new sensor.
@@ -45,7 +46,8 @@ def contents_of(files: Files) -> dict[str, Any]:
         ],
         "mosaics": [{"name": name, "label": _mosaic_label(name)} for name in mosaics()],
         "electronics": [
-            {"name": name, "label": PRESETS[name].title, "source": PRESETS[name].source} for name in electronics()
+            {"name": name, "label": each.title, "source": each.source, "scaling": each.scaling}
+            for name, each in ((name, PRESETS[name]) for name in electronics())
         ],
         "initial": INITIAL,
         "max_sites": MAX_SITES,

@@ -12,6 +12,7 @@ import numpy as np
 from foveasim._core.validation import check_choice, check_length_um
 from foveasim.config import build_shot
 from foveasim.layout import LAYOUTS, MOSAICS, Layout
+from foveasim.layout.generator_fields import RECTANGULAR, rounded_down, with_field, with_scale
 from foveasim.sensor import PRESETS
 from foveasim.studio._files import with_covering_scene, with_layout
 from foveasim.studio._messages.models import NewSensor, handles
@@ -22,23 +23,13 @@ from foveasim.studio._settings.unknowns import INSTEAD_OF, generated_layout, wit
 if TYPE_CHECKING:
     from foveasim.studio._session import Session
 
-#: Generators that fill a rectangle, with the parameters that its sides and the number of photosites replace.
-RECTANGULAR: dict[str, tuple[str, ...]] = {
-    "grid": ("n_x", "n_y", "pitch_um"),
-    "hexagonal": ("n_columns", "n_rows", "pitch_um"),
-    "octagonal": ("n_x", "n_y", "pitch_um"),
-    "tiling": ("pitch_um", "radius_um"),
-    "voronoi": (),
-}
 #: Parameters that follow the size of a photosite relative to the field: numbers of photosites along a line, and lengths.
 LINE_COUNTS = {"foveal_cartesian": ("n_fovea",), "giotto": ("n_rho", "n_fovea", "n_across")}
 SITE_LENGTHS = {"giotto": ("unit_um",), "log_polar": ("min_size_um",)}
 #: Ratios of neighbouring photosites, whose product over a line remains.
 RATIOS = {"foveal_cartesian": ("ring_ratio",)}
-#: Significant digits of lengths, and of the design rule for the smallest photosite.
-LENGTH_DIGITS, RULE_DIGITS = 7, 3
-#: Suffix of lengths.
-LENGTH = "_um"
+#: Significant digits of the design rule for the smallest photosite.
+RULE_DIGITS = 3
 #: Parameters of the range of the ADC.
 RANGE = {"capacitance_f", "v_sat_v"}
 #: Filters of mosaics that sensors have by name, their letters, and the mosaic with red at the top left.
@@ -101,18 +92,14 @@ def new_sensor(session: Session, message: NewSensor) -> dict[str, Any]:
 def _layout(generator: str, size_um: Sequence[float], n_sites: int, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the section of a layout in a format, with the design rules that it satisfies."""
     if generator in RECTANGULAR:
-        given = templates(f"{generator} parameters")
-        parameters = {name: value for name, value in given.items() if name not in RECTANGULAR[generator]}
-        section = _solved(generator, {**parameters, "size_um": list(size_um)}, n_sites, is_resized=False)
+        parameters = with_field(generator, templates(f"{generator} parameters"), size_um, size_um)
+        section = _solved(generator, parameters, n_sites, is_resized=False)
     else:
         section = _solved(generator, _refined(generator, n_sites), n_sites)
         factor = 0.5 * min(size_um) / float(np.abs(_built(section, settings).bounds_um).max())
-        section["parameters"] = {
-            name: _scaled(value, factor) if name.endswith(LENGTH) else value
-            for name, value in section["parameters"].items()
-        }
+        section["parameters"] = with_scale(section["parameters"], factor, 0.5 * min(size_um))
     min_size_um = float(_built(section, settings).size_um.min())
-    return {**section, "rules": {"min_size_um": _rounded_down(min_size_um, RULE_DIGITS), "max_overlap_um2": 0.0}}
+    return {**section, "rules": {"min_size_um": rounded_down(min_size_um, RULE_DIGITS), "max_overlap_um2": 0.0}}
 
 
 def _initial(generator: str) -> Layout | None:
@@ -168,16 +155,3 @@ def _unknown(generator: str) -> str | None:
     """Return the parameter that is solved for; None if the number of photosites is itself one."""
     solvable = LAYOUTS[generator].solve_for  # type: ignore[attr-defined]
     return str(solvable[0].name) if solvable else None
-
-
-def _scaled(value: Any, factor: float) -> Any:
-    """Return a length or lengths multiplied by a factor."""
-    if isinstance(value, list):
-        return [_scaled(item, factor) for item in value]
-    return _rounded_down(value * factor, LENGTH_DIGITS) if isinstance(value, int | float) else value
-
-
-def _rounded_down(value: float, n_digits: int) -> float:
-    """Return a positive number with a number of significant digits, not above it."""
-    unit = 10.0 ** (math.floor(math.log10(value)) - n_digits + 1)
-    return float(f"{math.floor(value / unit) * unit:.{n_digits}g}")

@@ -249,7 +249,7 @@ export class Editor {
   // Applies an action to the selected sites.
   act(name) {
     const { points, selected } = this;
-    if (name === "repair") { this.commit({ kind: "repair" }); return; }
+    if (name === "repair") { this.studio.repair(); return; }
     if (!selected.length || !points.length) { notice("Select photosites first"); return; }
     if (name === "merge" && selected.length < 2) { notice("Select two or more photosites that touch"); return; }
     if (name === "channel" && this.bar.number("channel") === null) { notice("Choose a filter first"); return; }

@@ -506,8 +506,9 @@ export class Controls {
         if (!isFiltered && row.isExtra) extra++;
         const isFound = (isFiltered || section.isFull || !row.isExtra || row.root.contains(document.activeElement))
           && words.every((word) => row.words.includes(word)) && (!isOnly || row.root.classList.contains("changed"));
-        change(row.root, { hidden: !isFound });
-        visible += isFound;
+        const isShown = isFound || !row.error.hidden;
+        change(row.root, { hidden: !isShown });
+        visible += Number(isShown);
       }
       found += visible;
       change(section.root, { hidden: visible === 0 && extra === 0 });
@@ -528,9 +529,10 @@ export class Controls {
     // A change of "sensor" marks its parts; a change of a part marks a choice among sections only if it is the one that is chosen.
     const isChanged = ({ key, kind }) => changed.has(key) || [...changed].some((one) => key.startsWith(one + ".") ||
       (one.startsWith(key + ".") && (kind !== "choice" || TAGS.includes(one.slice(key.length + 1)))));
-    const errors = { ...(state.errors || {}) }, rest = [];
+    const errors = { ...(state.errors || {}) }, rest = [], isWrong = (row) => !row.error.hidden, rows = [...this.rows.values()];
+    const known = new Set(rows.filter(isWrong));
     // A value of its own after a choice shows the error.
-    for (const row of [...this.rows.values()].reverse()) {
+    for (const row of [...rows].reverse()) {
       const { key } = row.control;
       if (row.control.do) { row.update(row.control.value, false, undefined, null); continue; }
       row.solve(state.solved?.[key]);
@@ -540,11 +542,15 @@ export class Controls {
     for (const [key, text] of Object.entries(errors)) rest.push(key && !text.includes(key) ? key + ": " + text : text);
     for (const section of this.sections.values()) {
       const n = section.rows.filter((row) => row.root.classList.contains("changed")).length;
-      const hasError = section.rows.some((row) => !row.error.hidden);
+      const hasError = section.rows.some(isWrong);
       change(section.count, { textContent: n ? shown(n) : "", title: n ? shown(n) + " changed" : "" });
       section.root.classList.toggle("wrong", hasError);
     }
     this._filter();
+    // A new error stays in view with its field.
+    const wrong = rows.find((row) => isWrong(row) && !known.has(row)), section = wrong?.root.closest("details");
+    if (section) section.open = true;
+    wrong?.root.scrollIntoView({ block: "nearest" });
     return rest;
   }
 }

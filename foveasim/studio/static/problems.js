@@ -7,7 +7,7 @@ import { $, change, find, make } from "/web/page_parts.js";
 const SATURATED = 0.01, MANY_SATURATED = 0.2;
 const OUTSIDE = /outside the image/;
 
-const percent = (fraction) => shown(Number((100 * fraction).toPrecision(2))) + " %";
+export const percent = (fraction) => shown(Number((100 * fraction).toPrecision(2))) + " %";
 
 // Returns problems as { text, view, count, isMild, canFit }; count is the badge of the tab of their view.
 /** @param {State} state @param {{ [name: string]: Part }} parts */

@@ -143,6 +143,15 @@ export class SitePane {
     map?.set(map.middle[0], map.middle[1], map.fitScale());
   }
 
+  // Sites of another pane with the same view are in view where all are; null for none.
+  /** @param {SitePane | null} pane */
+  compareWith(pane) {
+    const { map, isWhole } = this;
+    if (!map) return;
+    map.compared = pane?.map ?? null;
+    if (isWhole) this.fit();
+  }
+
   // Takes the view of another pane, also beyond the limits of these sites.
   follow(other) {
     if (!this.map) return;

@@ -128,8 +128,8 @@ export class StartPage {
     $("start-format-hint").textContent = format ? "Source: " + format.source + "." : "";
     $("start-filters-hint").textContent = $("start-filters").value && !generator?.has_mosaic
       ? "This layout has no rows for a mosaic: red, green and blue are assigned so that neighbours differ." : "";
-    const source = electronics.find(({ name }) => name === $("start-electronics").value)?.source;
-    $("start-electronics-hint").textContent = source ? "Source: " + source + "." : "";
+    const found = electronics.find(({ name }) => name === $("start-electronics").value);
+    $("start-electronics-hint").textContent = found ? found.scaling + " Source: " + found.source + "." : "";
   }
 
   // Width and height of the chosen format in mm.

@@ -3,7 +3,7 @@
 import { clamp } from "/web/colours.js";
 import { findRenderer, watchSize } from "/web/gl.js";
 import { positionText } from "/web/marks.js";
-import { $, change, inkOf, make, notice, speak, startTheme } from "/web/page_parts.js";
+import { $, change, endProblem, inkOf, make, notice, speak, startTheme } from "/web/page_parts.js";
 import { drawScaleBar, flyTo, panByKey, spokenSite, stopFlight, zoomByKey } from "/web/shell.js";
 import { offsetsOf } from "/web/unpack.js";
 import { Editor } from "./authoring.js";
@@ -188,16 +188,18 @@ function receive(message, { isFailed }) {
   if (kind !== "state" && kind !== "busy") showHeld();
   if (kind === "state") {
     hold(page.held.states, message);
-    if (isFailed && requests.waiting.some((one) => one.id === message.id)) notice(Object.values(message.errors)[0]);
+    if (isFailed && requests.waiting.some((one) => one.id === message.id)) notice(Object.values(message.errors)[0], true);
+    else if (!isFailed) endProblem();
   } else if (kind === "controls") controls.describe(message.controls);
   else if (kind === "done") finish(message);
-  else if (kind === "error") { notice(message.text); views.made.sweep?.fail(message); }
+  else if (kind === "error") { notice(message.text, true); views.made.sweep?.fail(message); }
   else if (kind === "text") awaited(files.receiveText(message));
   else if (kind === "gaze_path") gazePanel.usePath(message);
   else if (kind === "film_times") { sources.timesS = message.times_s; gazePanel.useTimes(message.times_s); }
   else if (kind === "saved") notice("Saved as " + message.path);
   else if (kind === "sought") views.show("goal", true).then(() => views.made.goal?.show(message));
   else if (kind === "sweep") showSweep(message);
+  else if (kind === "repair") views.made.rules?.dialog.show(message);
   else if (kind === "exists") files.askToReplace(message);
   else if (kind === "note") notice(message.text);
   else if (kind === "progress") { showStage(message.text); return; }
@@ -550,6 +552,8 @@ function showVariants() {
   document.body.classList.toggle("compares", isFrozen);
   $("freeze").setAttribute("aria-pressed", String(isFrozen));
   for (const name of MAPS) panes[name].resize();
+  panes.b.compareWith(isFrozen ? panes.a : null);
+  panes.a.compareWith(isFrozen ? panes.b : null);
   recolour();
   views.refresh();
   ask("map");
@@ -680,6 +684,7 @@ function createEditor() {
       views.need("rules", isOn);
     },
     showRules: () => views.show("rules", true),
+    repair: () => views.show("rules", true).then(() => views.made.rules?.openDialog()),
     showSteps: (index) => views.show("steps", true).then(() => views.made.steps?.open(index)),
   });
 }

@@ -30,7 +30,8 @@ const DEEPEST = 1e7;
 export class MapView {
   // Given by use().
   /** @type {Sites} */ sites;
-  /** @type {Point} */ middle;
+  // Another map with the same view, whose sites are shown, too.
+  /** @type {MapView | null} */ compared = null;
   /** @type {Uint32Array<ArrayBuffer>} */ colours;
   /** @type {number} */ extent;
   /** @type {number} */ x;
@@ -48,7 +49,6 @@ export class MapView {
   use(sites) {
     const [x0, y0, x1, y1] = sites.bounds;
     this.sites = sites;
-    this.middle = [0.5 * (x0 + x1), 0.5 * (y0 + y1)];
     this.extent = Math.max(x1 - x0, y1 - y0);
     if (this.x === undefined) [this.x, this.y] = this.middle;
     this.colours = new Uint32Array(textureSize(sites.n));
@@ -71,15 +71,27 @@ export class MapView {
     fitCanvas(this.canvas, this.width, this.height);
   }
 
-  // The scale at which the complete layout is in view.
+  // Bounds of all sites, also of those of the compared map.
+  get bounds() {
+    const { bounds } = this.sites, other = this.compared?.sites.bounds;
+    return other ? Array.from(bounds, (value, k) => (k < 2 ? Math.min : Math.max)(value, other[k])) : bounds;
+  }
+
+  /** @returns {Point} */
+  get middle() {
+    const [x0, y0, x1, y1] = this.bounds;
+    return [0.5 * (x0 + x1), 0.5 * (y0 + y1)];
+  }
+
+  // The scale at which all sites are in view.
   fitScale() {
-    const [x0, y0, x1, y1] = this.sites.bounds;
+    const [x0, y0, x1, y1] = this.bounds;
     return 0.94 * Math.min(this.width / (x1 - x0), this.height / (y1 - y0));
   }
 
   /** @param {number} x @param {number} y @param {number} scale */
   set(x, y, scale) {
-    const [x0, y0, x1, y1] = this.sites.bounds, fit = this.fitScale();
+    const [x0, y0, x1, y1] = this.bounds, fit = this.fitScale();
     this.scale = clamp(scale, 0.5 * fit, DEEPEST * fit);
     this.x = clamp(x, x0, x1);
     this.y = clamp(y, y0, y1);

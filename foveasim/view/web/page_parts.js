@@ -93,15 +93,20 @@ export function startTheme(onChange) {
 
 // -- notices, visible and for screen readers ----------------------------------------------------------------------------------
 
-let noticing = 0, speaking = 0;
+let noticing = 0, speaking = 0, isProblem = false;
 
+// Shows a text for some seconds; a problem at most until its cause ends.
 /** @param {string} text */
-export function notice(text) {
+export function notice(text, ofProblem = false) {
   $("notice").textContent = text;
   $("notice").hidden = false;
+  isProblem = ofProblem;
   clearTimeout(noticing);
   noticing = setTimeout(() => { $("notice").hidden = true; }, 2600);
 }
+
+// The cause of a problem has ended.
+export function endProblem() { if (isProblem) $("notice").hidden = true; }
 
 // Shows a notice until it is null.
 /** @param {string | null} text */

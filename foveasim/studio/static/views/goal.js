@@ -4,6 +4,7 @@ import { make, notice } from "/web/page_parts.js";
 import { addFiles } from "../chart_files.js";
 import { CurveChart } from "../charts.js";
 import { ConditionForm } from "../condition_form.js";
+import { percent } from "../problems.js";
 import { SettingSelect, isWide } from "../number_settings.js";
 import { figure } from "./requirements.js";
 
@@ -47,8 +48,9 @@ export function create(root, studio) {
     // Shows the answer of the server.
     show(found) {
       asked = null;
-      text.textContent = found.label + " of " + figure(found.value, found.unit) + ": " + found.subject + " "
-        + figure(found.result, found.result_unit);
+      text.textContent = (found.is_present ? "Already met: " : "") + found.label + " of " + figure(found.value, found.unit) + ": "
+        + found.subject + " " + figure(found.result, found.result_unit)
+        + (found.saturated_fraction ? " (" + percent(found.saturated_fraction) + " saturated)" : "");
       const points = found.curve.filter((point) => Number.isFinite(point[1])), xs = points.map((point) => point[0]);
       frame.replaceChildren();
       const isLog = isWide(xs[0], xs[xs.length - 1]);
@@ -57,7 +59,9 @@ export function create(root, studio) {
         y: points.map((point) => point[1]) };
       /** @type {any} */
       const marks = [{ x: found.value, y: found.result, name: "", kind: "dot" }];
-      chart.use([curve], { marks });
+      const limits = found.limits.flatMap((limit, k) => (limit === null ? [] : [{ ...curve, label: ["at least", "at most"][k],
+        x: [xs[0], xs[xs.length - 1]], y: [limit, limit], isDashed: true }]));
+      chart.use([curve, ...limits], { marks });
     },
   };
 }

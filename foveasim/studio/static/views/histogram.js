@@ -4,6 +4,7 @@ import { shown } from "/web/colours.js";
 import { statistics } from "/web/measure.js";
 import { make } from "/web/page_parts.js";
 import { addFiles } from "../chart_files.js";
+import { percent } from "../problems.js";
 import { Histogram } from "../charts.js";
 
 // Returns statistics of the values of a pane by name, as texts.
@@ -35,9 +36,13 @@ export function create(root, { page, panes, setRange }) {
     onValues() {
       const { a, b } = panes, { unit } = b.column || {};
       if (!b.scale) return;
-      list.replaceChildren(...Object.entries(statisticsOf(b)).map(([name, value]) => {
+      const { n_sites: n, saturated_fraction: fraction } = page.state?.summary || {}, figures = statisticsOf(b);
+      const isSignal = b.column.is_signal || ["code", "picture"].includes(b.column.key);
+      if (isSignal && fraction) figures.saturated = percent(fraction);
+      if (isSignal && n && figures.n !== shown(n)) figures.n += " of " + shown(n);
+      list.replaceChildren(...Object.entries(figures).map(([name, value]) => {
         const item = make("div");
-        item.append(make("dt", name), make("dd", value + (unit && name !== "n" ? " " + unit : "")));
+        item.append(make("dt", name), make("dd", value + (unit && !["n", "saturated"].includes(name) ? " " + unit : "")));
         return item;
       }));
       // The page draws it with the mark of the photosite.

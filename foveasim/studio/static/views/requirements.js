@@ -3,6 +3,7 @@
 import { quantity } from "/web/colours.js";
 import { make, notice } from "/web/page_parts.js";
 import { ConditionForm } from "../condition_form.js";
+import { percent } from "../problems.js";
 
 // Results may be infinite, or have no value.
 export function figure(value, unit) {
@@ -27,7 +28,8 @@ export function create(root, studio) {
 
   function itemOf(row, i) {
     const item = make("li"), mark = make("b", row.is_met ? "✓" : "✗"), remove = make("button", "✕", "step-remove");
-    const margin = row.margin === null ? row.problem : "got " + figure(row.value, row.unit) + ", margin " + figure(row.margin, row.unit);
+    const margin = row.margin === null ? row.problem : "got " + figure(row.value, row.unit) + ", margin " + figure(row.margin, row.unit)
+      + (row.saturated_fraction ? ", " + percent(row.saturated_fraction) + " saturated" : "");
     item.classList.toggle("wrong", !row.is_met);
     mark.setAttribute("aria-label", row.is_met ? "met" : "not met");
     remove.type = "button";

@@ -2,6 +2,7 @@
 
 import { quantity, shown } from "/web/colours.js";
 import { make } from "/web/page_parts.js";
+import { percent } from "../problems.js";
 
 // Words of the summary that have another form than the key.
 const SUMMARY = {
@@ -21,10 +22,13 @@ function textOf(key, value) {
 
 // Returns the rows of the numbers of a summary, beside those of variant A if there is one.
 function summaryRows(summary, before) {
+  // Values of signals count saturated photosites with their clipped signal.
+  const text = (key, of) => textOf(key, of[key]) + (["mean_dn", "median_e"].includes(key) && of.saturated_fraction > 0
+    ? " (" + percent(of.saturated_fraction) + " saturated)" : "");
   const rows = Object.entries(summary).filter(([, value]) => typeof value === "number").map(([key, value]) => {
     const row = make("tr"), name = make("th", SUMMARY[key]?.[0] || key.replaceAll("_", " "));
     name.scope = "row";
-    row.append(name, ...(before ? [make("td", textOf(key, before[key]))] : []), make("td", textOf(key, value)));
+    row.append(name, ...(before ? [make("td", text(key, before))] : []), make("td", text(key, summary)));
     row.classList.toggle("differs", Boolean(before) && before[key] !== value);
     return row;
   });
