@@ -56,7 +56,7 @@ type Arrays = { [name: string]: any };
 
 interface Preset { name: string; label: string; kind: string }
 interface ViewAbout {
-  name: string; label: string; is_tile: boolean; is_first: boolean; is_wide: boolean; is_lazy: boolean; has_data: boolean;
+  name: string; label: string; group: string; is_tile: boolean; is_first: boolean; is_wide: boolean; is_lazy: boolean; has_data: boolean;
 }
 // file: key of a file that the value lacks, as it lacks the required and optional parameters with these names.
 interface Choice { label: string; value: any; file?: string; required?: string[]; optional?: string[] }

@@ -12,7 +12,7 @@ from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, part
 
 
-@part("Requirements", lambda result: (result.capture, result.shot.requirements), order=95)
+@part("Requirements", lambda result: (result.capture, result.shot.requirements), order=95, group="Check")
 def requirements(result: Simulated) -> PartData:
     """Return the requirements with their results, and the results that can be limited."""
     rows: list[dict[str, Any]] = []

@@ -20,6 +20,7 @@ import { awaited, isPending } from "./pending.js";
 import { Problems } from "./problems.js";
 import { SitePane, useSoftware } from "./site_pane.js";
 import { Sources } from "./sources.js";
+import { showRows, startSplitters } from "./splitters.js";
 import { Views } from "./views.js";
 
 const BUSY_DELAY_MS = 150, LONG_MS = 1000;
@@ -130,6 +131,7 @@ function drawMarks() {
 function paint() { for (const pane of [panes.b, panes.a]) if (pane.scale && pane.map) pane.paint(page.range); }
 
 function resize() {
+  showRows();
   for (const name of MAPS) panes[name].resize();
   views.tell("draw");
   paint();
@@ -775,6 +777,7 @@ const studio = {
 Object.assign(window, { studio });
 
 function start() {
+  startSplitters();
   createPanes();
   controls = new Controls($("sections"), $("search"), $("only-changed"), $("hint"), {
     send: (key, value, isFinal) => connection.set(key, value, isFinal),

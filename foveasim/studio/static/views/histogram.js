@@ -1,20 +1,20 @@
 // Histogram and statistics of the values that the map shows.
 
-import { shown } from "/web/colours.js";
 import { statistics } from "/web/measure.js";
 import { make } from "/web/page_parts.js";
 import { addFiles } from "../chart_files.js";
 import { Histogram } from "../charts.js";
+import { quantity } from "../numbers.js";
 
 // Returns statistics of the values of a pane by name, as texts.
 function statisticsOf({ column, sites }) {
-  if (column.names) return { n: shown(sites.n) };
-  const sorted = column.values.slice().sort(), figure = (v) => (Number.isNaN(v) ? "–" : shown(Number(v.toPrecision(4))));
+  if (column.names) return { n: quantity(sites.n) };
+  const sorted = column.values.slice().sort(), figure = (v) => (Number.isNaN(v) ? "–" : quantity(v, column.unit));
   // NaN is last.
   const found = statistics(sorted, sorted.keys()), first = sorted.findIndex((v) => v > -Infinity);
   const median = found.n ? sorted[first + (found.n >> 1)] : NaN;
   return {
-    n: shown(found.n), mean: figure(found.mean), median: figure(median), std: figure(found.std), min: figure(found.min),
+    n: quantity(found.n), mean: figure(found.mean), median: figure(median), std: figure(found.std), min: figure(found.min),
     max: figure(found.max),
   };
 }
@@ -33,11 +33,11 @@ export function create(root, { page, panes, setRange }) {
     draw,
     onSite: draw,
     onValues() {
-      const { a, b } = panes, { unit } = b.column || {};
+      const { a, b } = panes;
       if (!b.scale) return;
       list.replaceChildren(...Object.entries(statisticsOf(b)).map(([name, value]) => {
         const item = make("div");
-        item.append(make("dt", name), make("dd", value + (unit && name !== "n" ? " " + unit : "")));
+        item.append(make("dt", name), make("dd", value));
         return item;
       }));
       // The page draws it with the mark of the photosite.

@@ -1,8 +1,8 @@
 // Noise budget: bars of the sources.
 
-import { shown } from "/web/colours.js";
 import { make } from "/web/page_parts.js";
 import { barRows } from "../charts.js";
+import { quantity } from "../numbers.js";
 
 export function create(root) {
   const bars = make("ul", undefined, "bars"), note = make("p", "", "quiet");
@@ -14,7 +14,7 @@ export function create(root) {
       const total = Math.hypot(...sources.map((source) => source.values));
       bars.replaceChildren(...barRows(sources, before?.about.sources, unit));
       note.textContent = sources.length
-        ? "Median over the photosites, " + unit + "; root sum of squares " + shown(Number(total.toPrecision(4))) + " " + unit + "."
+        ? "Medians over the photosites; root sum of squares " + quantity(total, unit, 3) + "."
         : "No noise.";
     },
   };
