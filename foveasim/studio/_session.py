@@ -34,8 +34,8 @@ from foveasim.studio._pictures import ReducedPictures
 from foveasim.studio._queue import IdleWork, Queue
 from foveasim.studio._settings.changes import changed_keys, match_filters
 from foveasim.studio._settings.controls import controls_of, structure_of
-from foveasim.studio._settings.labels import worded
 from foveasim.studio._settings.gaze import SessionGaze
+from foveasim.studio._settings.labels import worded
 from foveasim.studio._settings.unknowns import generated_layout, solved_of
 from foveasim.studio._settings.values import with_values
 from foveasim.studio._sweeps import Sweeps

@@ -35,7 +35,8 @@ def rules(result: Simulated) -> PartData:
     arrays: dict[str, NDArray[Any]] = {}
     report = _check(result.capture.layout, result.shot.rules)
     found = [
-        {**rule, "name": words_of(f"rules.{rule['name']}", {}).label or rule["name"]} for rule in rules_of(report, arrays)
+        {**rule, "name": words_of(f"rules.{rule['name']}", {}).label or rule["name"]}
+        for rule in rules_of(report, arrays)
     ]
     return {"rules": found, "is_satisfied": bool(report.ok)}, arrays
 

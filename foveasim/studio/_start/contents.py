@@ -11,14 +11,23 @@ from foveasim.sensor import PRESETS
 from foveasim.studio._engine import MAX_SITES
 from foveasim.studio._files import Files, preset_paths, presets, thumbnail_name
 from foveasim.studio._settings.templates import has_mosaic
-from foveasim.studio._start.new_sensor import BAYER, RECTANGULAR, electronics, generators, mosaics
+from foveasim.studio._start.new_sensor import (
+    BAYER,
+    FRAMES_PER_S,
+    N_SITES,
+    RECTANGULAR,
+    electronics,
+    generators,
+    mosaics,
+)
 from foveasim.studio._start.recent import recent_files
 
 #: Initial choices of a new sensor.
 INITIAL = {
     "generator": "log_polar",
     "format": "1/3",
-    "n_sites": 12_000,
+    "n_sites": N_SITES,
+    "frames_per_s": FRAMES_PER_S,
     "filters": BAYER,
     "electronics": "machine_vision",
 }

@@ -61,6 +61,7 @@ function splitterOf(place, id, label, way) {
   for (const type of ["pointerup", "pointercancel"]) splitter.addEventListener(type, () => { start = null; });
   splitter.addEventListener("dblclick", () => { use(way().name, null); show(); });
   splitter.addEventListener("focus", show);
+  for (const media of [narrow, wide]) media.addEventListener("change", show);
   splitter.addEventListener("keydown", (event) => {
     const [less, more] = way().axis === "x" ? ["ArrowLeft", "ArrowRight"] : ["ArrowUp", "ArrowDown"];
     const by = { [less]: -1, [more]: 1, Home: -way().sign * Infinity, End: way().sign * Infinity }[event.key];

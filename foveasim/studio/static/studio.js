@@ -10,6 +10,7 @@ import { Editor } from "./authoring.js";
 import { Connection, memory } from "./connection.js";
 import { Controls, valueAt } from "./controls.js";
 import { Files } from "./files.js";
+import { Transport } from "./film_row.js";
 import { inNextFrame } from "./frames.js";
 import { GazePanel } from "./gaze_panel.js";
 import { ImagePane } from "./image_pane.js";
@@ -788,11 +789,12 @@ function start() {
   });
   createEditor();
   const scene = () => [...controls.rows.values()].find(({ control: { key, kind } }) => key === "scene" && kind === "choice");
-  sources = new Sources($("pane-scene"), {
+  const transport = new Transport();
+  sources = new Sources($("pane-scene"), transport, {
     connection: () => connection, state: () => page.state, choose: () => $("chosen-file").click(),
     charts: () => scene()?.control.choices || [], playing: () => gazePanel.film?.pause(),
   });
-  gazePanel = new GazePanel($("pane-scene"), panes.scene, {
+  gazePanel = new GazePanel($("pane-scene"), panes.scene, transport, {
     connection: () => connection, state: () => page.state, playing: () => sources.film?.pause(), redraw: () => ask("marks"),
   });
   views = new Views(studio, () => { followSignals(); sendViews(); resize(); });
