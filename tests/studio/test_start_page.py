@@ -172,7 +172,7 @@ def test_new_sensor_follows_from_requirements(open_start):
     page.click("#start-form button")
     until(
         page,
-        f"() => {OPEN} && document.getElementById('start-problem').textContent.includes('room for 800 sites of 50 µm')",
+        f"() => {OPEN} && document.getElementById('start-problem').textContent.includes('possible are 800 of 50 µm')",
     )
     page.fill("#start-sites", "")
     page.click("#start-form button")

@@ -9,8 +9,8 @@ from typing import Any
 from foveasim._core.calls import Words
 from foveasim._core.validation import words_and_unit
 
-#: Names of settings in messages: a path before a colon, or a quoted name.
-NAMES = re.compile(r"^([a-z]\w*(?:\.\w+)*)(?=: )|'([a-z]\w*(?:\.\w+)*)'")
+#: Names of settings in messages: a path before a colon, the name of what must be something, and quoted names with a unit.
+NAMES = re.compile(r"^([a-z]\w*(?:\.\w+)*)(?=: )|'([a-z]\w*)'(?= must)|'([a-z]\w*)'")
 
 #: Words by the last name of a setting, or by its last two for a name with several meanings.
 WORDS: dict[str, Words] = {
@@ -258,9 +258,9 @@ def worded(text: str) -> str:
     """Return a message with the words of the controls: ``Exposure (exposure_s): must be ...``."""
 
     def with_words(found: re.Match[str]) -> str:
-        key = found[1] or found[2]
+        key = found[1] or found[2] or found[3]
         words, unit = words_and_unit(key.rpartition(".")[2])
         label = words_of(key, {}).label or (words if unit else "")
-        return found[0] if label in ("", key) else f"{label[0].upper()}{label[1:]} ({key})"
+        return found[0] if label in ("", key) or (found[3] and not unit) else f"{label[0].upper()}{label[1:]} ({key})"
 
     return NAMES.sub(with_words, text)

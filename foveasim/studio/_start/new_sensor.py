@@ -12,7 +12,7 @@ import numpy as np
 from foveasim._core.quantities import format_quantity
 from foveasim._core.validation import check_choice, check_length_um
 from foveasim.config import build_shot
-from foveasim.errors import SimulationError
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import LAYOUTS, MOSAICS, Layout
 from foveasim.scene import Scene
 from foveasim.sensor import PRESETS
@@ -89,7 +89,9 @@ def new_sensor(session: Session, message: NewSensor) -> dict[str, Any]:
         check_choice("filters", mosaic, mosaics())
     size_um = None if message.size_um is None else [check_length_um("size_um", each_um) for each_um in message.size_um]
     min_size_um = _min_size_um(session, message)
-    found = with_layout(without_gaze(settings), _layout(generator, size_um, _n_sites(message), min_size_um, settings))
+    is_most = message.n_sites is None
+    section = _layout(generator, size_um, _n_sites(message), min_size_um, settings, is_most=is_most)
+    found = with_layout(without_gaze(settings), section)
     found["sensor"] = {
         **(found.get("sensor") or {}),
         "preset": check_choice("electronics", message.electronics, electronics()),
@@ -124,7 +126,7 @@ def _min_size_um(session: Session, message: NewSensor) -> float | None:
 
 
 def _n_sites(message: NewSensor) -> int | None:
-    """Return the required number of photosites, also from the data rate."""
+    """Return the required number of photosites, or the largest one for the data rate."""
     if message.pixels_per_s is None:
         return message.n_sites
     frames_per_s = message.frames_per_s or FRAMES_PER_S
@@ -143,8 +145,14 @@ def _layout(
     n_sites: int | None,
     min_size_um: float | None,
     settings: Mapping[str, Any],
+    *,
+    is_most: bool = False,
 ) -> dict[str, Any]:
-    """Return the section of a layout that follows from what is given, with the design rules that it satisfies."""
+    """
+    Return the section of a layout that follows from what is given, with the design rules that it satisfies.
+
+    ``is_most``: whether fewer photosites are possible, too.
+    """
     if min_size_um is None:
         if size_um is None:
             raise SimulationError("the size of the sensor is not determined; give a format, or the smallest site")
@@ -152,50 +160,50 @@ def _layout(
     if size_um is None:
         n_sites = n_sites or N_SITES
         size_um = [min_size_um * math.sqrt(n_sites) * side for side in SHAPE]
-        factor = min_size_um / _smallest_um(_filled(generator, size_um, n_sites, settings))
+        factor = min_size_um / _filled(generator, size_um, n_sites, settings)["rules"]["min_size_um"]
         return _filled(generator, [factor * each_um for each_um in size_um], n_sites, settings)
+
+    (width_um, height_um), least_um = size_um, min_size_um
+
+    def contradiction(n_wanted: int, *possible: tuple[int, float]) -> SimulationError:
+        names = ", or ".join(f"{n:,} of {_um(each_um)}" for n, each_um in possible)
+        return SimulationError(
+            f"{generator.replace('_', ' ')} in {1e-3 * width_um:.4g} × {1e-3 * height_um:.4g} mm cannot have {n_wanted:,} "
+            f"photosites of {_um(least_um)}: possible are {names}"
+        )
+
     area_um2 = math.prod(size_um) if generator in RECTANGULAR else 0.25 * math.pi * min(size_um) ** 2
-    where = f"{generator.replace('_', ' ')} in {_um(size_um[0])} × {_um(size_um[1])}"
     n_most = round(area_um2 / min_size_um**2)
-    if (n_sites or 0) > (1.0 + 2.0 * TOLERANCE) * n_most:
-        raise SimulationError(
-            f"{where} has room for {n_most:,} sites of {_um(min_size_um)}, not for {n_sites:,}: possible are fewer photosites, "
-            f"or a smallest site of {_um(math.sqrt(area_um2 / (n_sites or 1)))}"
-        )
-    if n_most > MAX_SITES and generator in RECTANGULAR:
-        least_um = math.sqrt(area_um2 / MAX_SITES)
-        raise SimulationError(
-            f"{where} has {n_most:,} sites of {_um(min_size_um)}: possible are sites from {_um(least_um)}"
-        )
+    n_sites = None if is_most and (n_sites or 0) > n_most else n_sites
+    n_wanted = n_sites or (n_most if generator in RECTANGULAR else 0)
+    if n_wanted > min((1.0 + 2.0 * TOLERANCE) * n_most, MAX_SITES):
+        n_possible = min(n_wanted, MAX_SITES)
+        other = [(n_most, min_size_um)] if n_most < n_wanted else []
+        raise contradiction(n_wanted, *other, (n_possible, math.sqrt(area_um2 / n_possible)))
     if generator == "log_polar":
         given = templates("log_polar parameters") | {"min_size_um": min_size_um, "r_max_um": 0.5 * min(size_um)}
-        section = (
-            {"generator": generator, "parameters": given} if n_sites is None else _solved(generator, given, n_sites)
-        )
+        section = {"generator": generator, "parameters": _with_sectors(given, n_sites) if n_sites else given}
+        n_built = _built(section, settings).n_sites
+        if n_sites and abs(n_built / n_sites - 1.0) > TOLERANCE:
+            raise contradiction(n_sites, (n_built, min_size_um))
         return _with_rules(section, settings)
-    n_tried = n_sites or (n_most if generator in RECTANGULAR else min(n_most, N_SITES))
+    n_tried = n_wanted or min(n_most, N_SITES)
     for _ in range(1 if n_sites else MAX_TRIES):
         section = _filled(generator, size_um, max(1, n_tried), settings)
-        ratio = _smallest_um(section) / min_size_um
+        ratio = section["rules"]["min_size_um"] / min_size_um
         if abs(ratio - 1.0) <= TOLERANCE:
             return section
         n_tried = round(n_tried * ratio**2)
-    possible = [f"sites of {_um(ratio * min_size_um)}"]
+    n_built = _built(section, settings).n_sites
+    other = []
     if n_sites:
         n_possible = _built(_layout(generator, size_um, None, min_size_um, settings), settings).n_sites
-        possible = [f"{n_possible:,} photosites of {_um(min_size_um)}", f"{n_sites:,} of {_um(ratio * min_size_um)}"]
-    raise SimulationError(
-        f"format, smallest site and number of photosites contradict each other: {where} can have {', or '.join(possible)}"
-    )
+        other = [(n_possible, min_size_um)]
+    raise contradiction(n_sites or n_most, *other, (n_built, ratio * min_size_um))
 
 
 def _um(length_um: float) -> str:
     return format_quantity(length_um, "µm", digits=3)
-
-
-def _smallest_um(section: Mapping[str, Any]) -> float:
-    """Return the smallest size of a site of a section with its rules, to which it is rounded down."""
-    return float(section["rules"]["min_size_um"])
 
 
 def _filled(generator: str, size_um: Sequence[float], n_sites: int, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -258,13 +266,17 @@ def _solved(generator: str, parameters: Mapping[str, Any], n_sites: int, *, is_r
 
 def _with_sectors(parameters: Mapping[str, Any], n_sites: int) -> dict[str, Any]:
     """Return parameters of log-polar rings with the number of sectors for about a number of photosites."""
-    found = dict(parameters)
+    found, n_sectors = dict(parameters), parameters["n_sectors"]
     for _ in range(MAX_TRIES):
-        n_built = LAYOUTS["log_polar"](**found).n_sites
-        n_sectors = max(3, round(found["n_sectors"] * math.sqrt(n_sites / n_built)))
+        try:
+            n_built = LAYOUTS["log_polar"](**{**found, "n_sectors": n_sectors}).n_sites
+        except ParameterError:  # more sectors than the field has room for
+            n_sectors = (found["n_sectors"] + n_sectors) // 2
+            continue
+        found["n_sectors"] = n_sectors
+        n_sectors = max(3, round(n_sectors * math.sqrt(n_sites / n_built)))
         if n_sectors == found["n_sectors"]:
             break
-        found["n_sectors"] = n_sectors
     return found
 
 
