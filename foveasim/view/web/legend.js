@@ -64,7 +64,7 @@ export function swatchesOf(colours) {
 
 // Range and mean of the numbers of a scale, with their unit.
 export function summaryOf(scale) {
-  const { column, values } = scale, unit = column.unit ? " " + column.unit : "";
+  const { column, values } = scale, unit = column.unit ? " " + unitText(column.unit) : "";
   let sum = 0, count = 0;
   for (let i = 0; i < values.length; i++) if (Number.isFinite(values[i])) { sum += values[i]; count++; }
   return count === 0 ? "no values" :
