@@ -49,7 +49,9 @@ function splitterOf(place, id, label, way) {
   };
   const move = (from, by) => {
     if (!(from.size > 0)) return;
-    use(way().name, Number(((from.value * clamp(from.size + way().sign * by, LEAST, Math.max(LEAST, most()))) / from.size).toPrecision(6)));
+    const size = clamp(from.size + way().sign * by, LEAST, Math.max(LEAST, most()));
+    // In pixels, or relative to the size before.
+    use(way().name, from.value > 1 ? Math.round(size) : Number(((from.value * size) / from.size).toPrecision(6)));
     show();
   };
   const along = (event) => (way().axis === "x" ? event.clientX : event.clientY);
