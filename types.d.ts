@@ -56,7 +56,7 @@ type Arrays = { [name: string]: any };
 
 interface Preset { name: string; label: string; kind: string }
 interface ViewAbout {
-  name: string; label: string; is_tile: boolean; is_first: boolean; is_wide: boolean; is_lazy: boolean; has_data: boolean;
+  name: string; label: string; group: string; is_tile: boolean; is_first: boolean; is_wide: boolean; is_lazy: boolean; has_data: boolean;
 }
 // file: key of a file that the value lacks, as it lacks the required and optional parameters with these names.
 interface Choice { label: string; value: any; file?: string; required?: string[]; optional?: string[] }
@@ -84,7 +84,7 @@ interface StartContents {
   presets: StartPreset[]; generators: { name: string; label: string; text: string; fills_format: boolean; has_mosaic: boolean }[];
   formats: { name: string; label: string; size_um: number[]; source: string }[]; mosaics: { name: string; label: string }[];
   electronics: { name: string; label: string; source: string; scaling: string }[]; max_sites: number; recent: RecentFile[] | null;
-  initial: { generator: string; format: string; n_sites: number; filters: string; electronics: string };
+  initial: { generator: string; format: string; n_sites: number; frames_per_s: number; filters: string; electronics: string };
 }
 interface Busy { kind: "busy" }
 interface ControlsMessage { kind: "controls"; controls: Control[] }
@@ -154,7 +154,7 @@ type Change =
   | { do: "repair"; method: "best" | "drop" | "shrink" | "merge" | "refill" }
   | { do: "apply"; variant: string }
   | { do: "preset"; name: string }
-  | { do: "new_sensor"; generator: string; size_um: number[]; n_sites: number; filters?: string | null; electronics: string }
+  | { do: "new_sensor"; generator: string; size_um?: number[] | null; n_sites?: number | null; min_size_um?: number | null; sites_per_deg?: number | null; pixels_per_s?: number | null; frames_per_s?: number | null; filters?: string | null; electronics: string }
   | { do: "restore"; settings: { [name: string]: unknown } | undefined }
   | { do: "file"; path: string | undefined; as?: "scene" | "layout" | "settings" | null }
   | { do: "video"; path: string | undefined }

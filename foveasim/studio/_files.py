@@ -77,7 +77,7 @@ def thumbnail_name(name: str) -> str:
 
 def apply_preset(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return the settings of a preset; a layout replaces that of the given settings.
+    Return the settings of a preset; a layout replaces that of the given settings, at the centre of the image.
 
     Raises ParameterError when the preset does not exist.
     """
@@ -86,7 +86,15 @@ def apply_preset(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
         raise ParameterError("name", "must be the name of a preset", printable(name))
     if name.startswith("shot:"):
         return start_settings(path)[0]
-    return with_layout(settings, resolve_files(path.parent, read_yaml(path)))
+    return with_layout(without_gaze(settings), resolve_files(path.parent, read_yaml(path)))
+
+
+def without_gaze(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings with the sensor at the centre of the image."""
+    found = copy.deepcopy(dict(settings))
+    found.pop("gaze_um", None)
+    found.get("scene", {}).pop("gaze_range_um", None)
+    return found
 
 
 def with_layout(settings: Mapping[str, Any], layout: Any) -> dict[str, Any]:

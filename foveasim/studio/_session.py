@@ -36,6 +36,7 @@ from foveasim.studio._queue import IdleWork, Queue
 from foveasim.studio._settings.changes import changed_keys, match_filters
 from foveasim.studio._settings.controls import controls_of, structure_of
 from foveasim.studio._settings.gaze import SessionGaze
+from foveasim.studio._settings.labels import worded
 from foveasim.studio._settings.unknowns import generated_layout, solved_of
 from foveasim.studio._settings.values import with_values
 from foveasim.studio._sweeps import Sweeps
@@ -563,8 +564,10 @@ class Session:
         self.send({"kind": "text", "id": number, "what": what, "text": text, "files": files})
 
     def line(self, error: BaseException) -> str:
-        """Return an error in one line, without the directory of uploads."""
-        return str(error) if isinstance(error, CancelledError) else one_line(error).replace(f"{self.uploads}/", "")
+        """Return an error in one line in the words of the controls, without the directory of uploads."""
+        if isinstance(error, CancelledError):
+            return str(error)
+        return worded(one_line(error).replace(f"{self.uploads}/", ""))
 
     def _send_error(self, number: Any, error: BaseException) -> None:
         self.send({"kind": "error", "id": number, "text": self.line(error)})

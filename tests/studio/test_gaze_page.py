@@ -232,16 +232,16 @@ def test_replay_and_slider_follow_the_path(visit):
 
     np.testing.assert_allclose([xy for _, *xy in shown], [interpolated(ROWS, t) for t, *_ in shown], atol=1e-9)
     assert gaze(page) == ROWS[-1][1:]
-    assert page.inner_text("#gaze .quiet") == "0.40 s · -200.0, 100.0 µm"
+    assert page.inner_text("#transport .quiet") == "0.40 s · -200.0, 100.0 µm"
     assert page.evaluate("studio.panes.scene.position") == ROWS[-1][1:]
     assert steps(page) == n_steps + 1
 
     before = steps(page)
-    page.locator("#gaze input[type=range]").fill("3")
+    page.locator("#transport input[type=range]").fill("3")
     settle(page)
 
     assert gaze(page) == pytest.approx(interpolated(ROWS, 0.1))
-    assert page.locator("#gaze input[type=range]").get_attribute("aria-valuetext").startswith("0.10 s")
+    assert page.locator("#transport input[type=range]").get_attribute("aria-valuetext").startswith("0.10 s")
     assert steps(page) == before + 1
 
 
@@ -299,8 +299,8 @@ def test_table_edits_are_undo_steps(visit):
     assert [row[0] for row in path_of(page)] == [0.2, 0.25, 0.4]
     page.fill("[aria-label='time of row 1, s']", "0.25")
     page.keyboard.press("Enter")
-    until(page, "() => document.querySelector('#gaze .quiet.wrong')")
-    assert "0.25 s in row 2 after 0.25 s in row 1" in page.inner_text("#gaze .quiet")
+    until(page, "() => document.querySelector('#transport .quiet.wrong')")
+    assert "0.25 s in row 2 after 0.25 s in row 1" in page.inner_text("#transport .quiet")
     until(page, "() => document.querySelector(\"[aria-label='time of row 1, s']\").value === '0.2'")
     page.click("[aria-label='Delete row 3']")
     settle(page)
@@ -403,7 +403,7 @@ def test_path_works_by_keyboard(visit):
     moved = rows[-1, 1:] - start
     assert moved[0] > 0
     assert moved[0] == pytest.approx(2 * moved[1], rel=0.01)
-    keys.use("#gaze [aria-label='Play the gaze path']")
+    keys.use("#transport [aria-label='Play the gaze path']")
     until(page, "() => !studio.gazePanel.film.isPlaying && studio.gazePanel.film.n > 0")
     settle(page)
     keys.use("#gaze [aria-label='Show the rows of the gaze path']")
@@ -434,7 +434,7 @@ def test_row_has_no_serious_violations(visit):
         assert violations_in_themes(page, "#pane-scene") == [], width
         page.click("#gaze .menu >> text=Saccades…")
         assert violations_in_themes(page, "#saccades-dialog") == [], width
-        row, pane = (page.locator(each).bounding_box() for each in ("#gaze", "#pane-scene"))
+        row, pane = (page.locator(each).bounding_box() for each in ("#transport", "#pane-scene"))
         assert row["x"] + row["width"] <= pane["x"] + pane["width"] + 0.5
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         page.keyboard.press("Escape")

@@ -94,7 +94,7 @@ def test_waiting_replays_are_simulated_once(recorder):
         ({"do": "follow", "final": True}, "'t_s'"),
         ({"do": "saccades", "seed": -1, "duration_s": 1.0}, "'seed'"),
         ({"do": "saccades", "seed": 1, "duration_s": "long"}, "'duration_s'"),
-        ({"do": "saccades", "seed": 1, "duration_s": 1e6}, "'duration_s' must be at most"),
+        ({"do": "saccades", "seed": 1, "duration_s": 1e6}, "(duration_s) must be at most"),
         ({"do": "gaze_file", "path": "/etc/passwd"}, "is not available here"),
         ({"do": "set", "key": "gaze_path", "value": [[0, 0, 0], [0, 1, 1]]}, "0 s in row 2 after 0 s in row 1"),
     ],

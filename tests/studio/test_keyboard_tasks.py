@@ -211,7 +211,7 @@ def test_gaze_is_recorded_over_video(keys, tmp_path):
     keys.use("#gaze-path")
     keys.use("#gaze .record")
     for n in (2, 5):
-        keys.to("#film input[type=range]")
+        keys.to("#transport input[type=range]")
         keys.press(*["ArrowRight"] * (n - page.evaluate("studio.state.film.n")))
         until(page, "n => studio.state.film.n === n && !studio.sources.film.isBusy", n)
         keys.to("#scene .marks")
@@ -221,7 +221,7 @@ def test_gaze_is_recorded_over_video(keys, tmp_path):
     keys.use("#gaze .record")
     until(page, "() => studio.state.settings.gaze_path")
     rows = setting(page, "gaze_path")
-    keys.use("#gaze [aria-label='Play the gaze path']")
+    keys.use("#transport [aria-label='Play the gaze path']")
     until(page, "() => !studio.gazePanel.film.isPlaying && studio.state.film.n === 11")
     keys.wait()
 

@@ -124,14 +124,14 @@ def test_dropped_video_shows_its_frames(visit, tmp_path):
         settle(page)
         second = codes(page)
         assert second.mean() > first.mean()
-        page.locator("#film input").fill("11")
+        page.locator("#transport input").fill("11")
         until(page, "() => studio.state.film.n === 11")
         settle(page)
         assert codes(page).mean() > second.mean()
         page.click("[aria-label='One frame back']")
         until(page, "() => studio.state.film.n === 10")
         settle(page)
-        assert "11 / 12" in page.inner_text("#film .quiet")
+        assert "11 / 12" in page.inner_text("#transport .quiet")
         change(page, "() => { studio.connection.send({ do: 'undo' }); }")
         assert setting(page, "scene.picture") == "skimage:astronaut"
         assert page.is_hidden("#film")
@@ -177,7 +177,7 @@ def test_frames_are_archived_and_stepped_by_keys(visit, tmp_path):
         page.evaluate("() => release()")
         until(page, "n => shown.length === n", n)
 
-    slider = page.locator("#film input[type=range]")
+    slider = page.locator("#transport input[type=range]")
     slider.press("ArrowRight")
     slider.press("ArrowRight")
     release(2)
@@ -439,7 +439,7 @@ def test_equal_variants_have_equal_rows(visit):
 
     assert all(a == b and difference == "0" for a, b, difference in found.values())
     assert found["bits_per_frame"] == ["9,120", "9,120", "0"]
-    assert found["frames_per_s"] == ["50 1/s", "50 1/s", "0"]
+    assert found["frames_per_s"] == ["50 /s", "50 /s", "0"]
     assert page.locator("#comparison .best").count() == 0
 
 

@@ -144,12 +144,13 @@ def test_new_sensor_is_centred(make_session):
     [
         ({"generator": "spiral"}, "'generator' must be one of"),
         ({"generator": ["grid"]}, "'generator' must be a string"),
-        ({"size_um": [0.0, 3600.0]}, "'size_um'"),
-        ({"size_um": "wide"}, "'size_um' must be the width and the height"),
-        ({"n_sites": 0}, "'n_sites' must be an integer from 1 to 2,000,000, got 0"),
-        ({"n_sites": 10**9}, "'n_sites' must be an integer from 1 to 2,000,000"),
-        ({"n_sites": None}, "'n_sites' must be"),
-        ({"filters": "cmyk"}, "'filters' must be one of"),
+        ({"size_um": [0.0, 3600.0]}, "(size_um)"),
+        ({"size_um": "wide"}, "(size_um) must be the width and the height"),
+        ({"n_sites": 0}, "Photosites (n_sites) must be an integer from 1 to 2,000,000, got 0"),
+        ({"n_sites": 10**9}, "Photosites (n_sites) must be an integer from 1 to 2,000,000"),
+        ({"n_sites": "many"}, "Photosites (n_sites) must be"),
+        ({"min_size_um": 0}, "must be a positive number, got 0"),
+        ({"filters": "cmyk"}, "(filters) must be one of"),
         ({"electronics": "paper_read_noise"}, "'electronics' must be one of"),
         ({"generator": "zones", "n_sites": 2}, "the nearest is"),
     ],
@@ -158,6 +159,93 @@ def test_invalid_templates_are_rejected(recorder, settings, changes, message):
     state = create(recorder, **changes)
 
     assert message in state["errors"]["new_sensor"]
+    assert state["settings"] == settings
+
+
+# -- requirements of new sensors ------------------------------------------------------------------------------------------
+
+FORMAT_UM = [4800.0, 3600.0]
+
+
+@pytest.mark.slow(keep=2)
+@pytest.mark.parametrize("generator", ["grid", "log_polar", "hexagonal", "giotto", "sunflower"])
+@pytest.mark.parametrize("has_format", [True, False])
+def test_smallest_site_is_as_required(recorder, generator, has_format):
+    wanted = {"size_um": FORMAT_UM, "n_sites": None} if has_format else {"size_um": None, "n_sites": 2000}
+    state = create(recorder, generator=generator, min_size_um=40.0, **wanted)
+    layout = recorder.session.result.capture.layout
+    x0_um, y0_um, x1_um, y1_um = layout.bounds_um
+
+    assert state["errors"] == {}
+    assert np.sqrt(layout.area_um2.min()) == pytest.approx(40.0, rel=0.05)
+    if has_format:
+        assert x1_um - x0_um <= FORMAT_UM[0] * (1.0 + 1e-9)
+        assert 3000.0 < y1_um - y0_um <= FORMAT_UM[1] * (1.0 + 1e-9)
+    else:
+        assert layout.n_sites == pytest.approx(2000, rel=0.08)
+
+
+def test_resolution_at_gaze_follows_from_lens(recorder):
+    """The image of the test scene, at 1 m, is 8.0645 mm behind the lens of 8 mm: 1 / (1/8 - 1/1000)."""
+    create(recorder, generator="grid", size_um=FORMAT_UM, n_sites=None, sites_per_deg=4.0)
+    pitch_um = np.sqrt(recorder.session.result.capture.layout.area_um2.min())
+
+    assert pitch_um == pytest.approx(8064.5 * np.tan(np.pi / 180) / 4.0, rel=0.05)
+
+
+def test_data_rate_limits_number_of_sites(recorder):
+    create(recorder, generator="grid", size_um=FORMAT_UM, n_sites=None, pixels_per_s=60_000.0, frames_per_s=20.0)
+
+    assert recorder.session.result.capture.layout.n_sites == pytest.approx(3000, rel=0.03)
+
+
+def test_new_log_polar_sensor_has_filled_fovea(recorder):
+    create(recorder, generator="log_polar", n_sites=1500)
+    layout = recorder.session.result.capture.layout
+
+    assert np.hypot(*layout.centroid_um.T).min() < layout.size_um.min()
+
+
+def test_layout_with_blind_spot_is_centred(make_session):
+    recorder = make_session(start=apply_preset("shot:foveal", {}))
+    state = recorder.do(do="preset", name="layout:foveal_blind_spot", id=1)
+
+    assert state["errors"] == {}
+    assert state["settings"].get("gaze_um") is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "parts"),
+    [
+        ({"n_sites": None, "size_um": None}, ["give a format, or the smallest site"]),
+        # A grid of 4.8 × 3.6 mm has 120 × 90 sites of 40 µm.
+        (
+            {"min_size_um": 40.0, "n_sites": 3000},
+            ["cannot have 3,000 photosites of 40 µm", "possible are 10,800 of 40 µm, or 3,", " of 7"],
+        ),
+        ({"min_size_um": 40.0, "n_sites": 50_000}, ["possible are 10,800 of 40 µm, or 50,000 of 18.6 µm"]),
+        (
+            {"generator": "log_polar", "min_size_um": 100.0, "n_sites": 5000},
+            ["in 4.8 × 3.6 mm", "possible are 1,018 of 100 µm"],
+        ),
+        (
+            {"min_size_um": 0.4, "n_sites": None},
+            ["108,000,000 photosites of 0.4 µm", "possible are 2,000,000 of 2.94 µm"],
+        ),
+        (
+            {"min_size_um": 40.0, "sites_per_deg": 10.0},
+            ["require sites of 14.1 µm", "possible are 3.519 sites per degree"],
+        ),
+        ({"n_sites": 2000, "pixels_per_s": 30_000.0}, ["possible are 1,000 at 30 frames/s, or 15 frames/s"]),
+    ],
+)
+def test_contradicting_requirements_are_explained(recorder, settings, changes, parts):
+    state = create(recorder, **changes)
+    text = state["errors"]["new_sensor"]
+
+    for part in parts:
+        assert part in text
+    assert ". " not in text
     assert state["settings"] == settings
 
 

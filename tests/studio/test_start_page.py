@@ -160,11 +160,39 @@ def test_new_sensor_is_created_by_keyboard(open_start):
     assert page.evaluate(N_SITES) == pytest.approx(1200, rel=0.05)
 
 
+def test_new_sensor_follows_from_requirements(open_start):
+    page = open_start()
+    settle(page)
+    page.select_option("#start-generator", "grid")
+    page.select_option("#start-format", "own")
+    page.fill("#start-width", "2")
+    page.fill("#start-height", "1")
+    page.fill("#start-smallest", "50 µm")
+    page.fill("#start-sites", "5,000")
+    page.click("#start-form button")
+    until(
+        page,
+        f"() => {OPEN} && document.getElementById('start-problem').textContent.includes('possible are 800 of 50 µm')",
+    )
+    page.fill("#start-sites", "")
+    page.click("#start-form button")
+    until(page, STEPS)
+
+    assert page.evaluate(N_SITES) == 800
+    assert page.inner_text("#notice") == "800 photosites, the smallest of 50 µm"
+
+
 def test_invalid_sensors_are_explained(open_start):
     page = open_start()
     page.fill("#start-sites", "many")
     page.click("#start-form button")
     assert page.inner_text("#start-problem") == "Photosites must be an integer from 1 to 2,000,000."
+
+    page.fill("#start-sites", "2000")
+    page.fill("#start-smallest", "tiny")
+    page.click("#start-form button")
+    assert page.inner_text("#start-problem") == "Smallest site must be a positive number."
+    page.fill("#start-smallest", "")
 
     page.select_option("#start-format", "own")
     page.fill("#start-width", "0")

@@ -432,7 +432,7 @@ def test_site_colours_follow_selected_column(visit):
     assert drawn() == pytest.approx([255 * fraction ** (1 / 2.2)] * 3, abs=2)
     hover(page, x, y)
     assert row(page, "code") == f"{CAPTURE.code[site]:,} DN"
-    assert row(page, "electrons") == f"{CAPTURE.electrons[site]:,} e-"
+    assert row(page, "electrons") == f"{CAPTURE.electrons[site]:,} e⁻"
     assert row(page, "filter") == "G"
     assert float(row(page, "signal-to-noise ratio")) == pytest.approx(CAPTURE.signal_to_noise()[site], rel=1e-5)
     assert page.evaluate(f"foveasim.values({site}).expected_e") == CAPTURE.expected_e[site]
@@ -1605,7 +1605,7 @@ def test_selection_statistics_match_numpy(visit, tmp_path):
 
     rows = page.locator("#statistics tr").all_inner_texts()
     assert rows[0].split() == ["n", "mean", "std", "min", "max"]
-    for title, values in (("code / DN", CAPTURE.code), ("electrons / e-", CAPTURE.electrons), ("expected electrons / e-", CAPTURE.expected_e)):  # fmt: skip
+    for title, values in (("code / DN", CAPTURE.code), ("electrons / e⁻", CAPTURE.electrons), ("expected electrons / e⁻", CAPTURE.expected_e)):  # fmt: skip
         shown = [float(part.replace(",", "")) for part in rows[rows.index(title) + 1].split()]
         part = values[chosen].astype(float)
         assert shown[0] == chosen.size
@@ -1752,7 +1752,7 @@ def test_solid_page_colours_have_legend(visit):
     span = np.ptp(CAPTURE.expected_e)
     step = round(255 * (CAPTURE.expected_e[3] - CAPTURE.expected_e.min()) / span)
     assert page.evaluate("foveasim.colour(3)") == np.rint(255 * np.array(colormaps["viridis"](step))[:3]).tolist()
-    assert page.inner_text("#summary").startswith("expected electrons / e-: ")
+    assert page.inner_text("#summary").startswith("expected electrons / e⁻: ")
     assert len(page.locator("#ticks span").all_inner_texts()) >= 3
 
     page.select_option("#colouring", "channel")
@@ -1830,7 +1830,7 @@ def test_second_capture_shares_view_and_scale(visit):
     y_um = view["y"] - (py - view["height"] / 2) / view["scale"]
     page.mouse.move(box["x"] + px, box["y"] + py)
     assert page.evaluate("foveasim.hovered") == site_at(MOSAIC, x_um, y_um) >= 0
-    assert row(page, "second electrons") == f"{second.electrons[site_at(MOSAIC, x_um, y_um)]:,} e-"
+    assert row(page, "second electrons") == f"{second.electrons[site_at(MOSAIC, x_um, y_um)]:,} e⁻"
     page.select_option("#second-column", "")
     until(page, "foveasim.second === null")
     assert page.locator("#second").is_hidden()

@@ -30,6 +30,7 @@ UNCHECKED: Any = {"unchecked": True}
 Text = Annotated[str, Field(description="a string")]
 Flag = Annotated[bool, Field(description="true or false")]
 Number = Annotated[int | float | None, Field(description="a number")]
+Positive = Annotated[int | float | None, Field(gt=0, allow_inf_nan=False, description="a positive number")]
 Path = Annotated[str, Field(description="the path of a file", json_schema_extra=UNCHECKED)]
 PATH_OF_SETTING = Field(
     max_length=500, pattern=r"^[^.]+(\.[^.]+)*$", description="the path of a setting, such as sensor.bits"
@@ -272,15 +273,22 @@ class ApplyPreset(Change, do="preset"):
 
 class NewSensor(Change, do="new_sensor"):
     """
-    Create a sensor.
+    Create a sensor of what is given; the rest follows.
 
     ``size_um``: width and height of the format, which rasters fill, and in whose shorter side other layouts are inscribed.
-    ``n_sites``: approximately. ``filters``: name of a mosaic.
+    ``n_sites``: approximately; or ``pixels_per_s`` at ``frames_per_s``. ``min_size_um``: smallest site; or ``sites_per_deg``
+    at the gaze. ``filters``: name of a mosaic.
     """
 
     generator: Text
-    size_um: list[int | float] = _must_be("the width and the height of the sensor", min_length=2, max_length=2)
-    n_sites: int = _integer(1, MAX_SITES)
+    size_um: list[int | float] | None = _must_be(
+        "the width and the height of the sensor", None, min_length=2, max_length=2
+    )
+    n_sites: int | None = _integer(1, MAX_SITES, None)
+    min_size_um: Positive = None
+    sites_per_deg: Positive = None
+    pixels_per_s: Positive = None
+    frames_per_s: Positive = None
     filters: str | None = _must_be("the name of a mosaic", None)
     electronics: Text
 

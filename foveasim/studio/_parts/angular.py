@@ -28,7 +28,7 @@ def _cones_of(result: Simulated) -> tuple[Any, ...]:
     )
 
 
-@part("Angular response", _cones_of, order=85)
+@part("Angular response", _cones_of, order=85, group="Measure")
 def angular(result: Simulated) -> PartData:
     """Return the response to uniform light against image height: means and extremes of annuli."""
     camera, source = result.shot.camera, result.shot.scene

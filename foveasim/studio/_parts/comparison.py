@@ -18,7 +18,7 @@ def _captures_of(result: Simulated) -> tuple[Any, ...]:
     return (result.capture, *(each.capture for _, each in result.compared), tuple(name for name, _ in result.compared))
 
 
-@part("Comparison", _captures_of, order=130, is_of_variants=True)
+@part("Comparison", _captures_of, order=130, group="Check", is_of_variants=True)
 def comparison(result: Simulated) -> PartData:
     """Return budgets and picture quality of all variants, the current state last."""
     if not result.compared:

@@ -21,6 +21,7 @@ N_NEIGHBOURS = 64
     "MTF",
     lambda result: (result.capture.layout, result.shot.camera.optics, result.shot.scene, result.pinned),
     order=80,
+    group="Measure",
     is_first=True,
 )
 def mtf(result: Simulated) -> PartData:

@@ -10,7 +10,7 @@ from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, capture_of, part, saturation_of
 
 
-@part("Noise", capture_of, order=40, is_first=True)
+@part("Noise", capture_of, order=40, group="Measure", is_first=True)
 def noise(result: Simulated) -> PartData:
     """Return the noise budget: median over the photosites by source, e-."""
     sensor, capture = result.shot.camera.sensor, result.capture

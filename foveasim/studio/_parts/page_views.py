@@ -10,14 +10,14 @@ from foveasim.scene import Scene
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import page_part
 
-page_part("histogram", "Histogram", order=20, is_first=True)
-page_part("site", "Photosite", order=30, is_wide=True)
+page_part("histogram", "Histogram", order=20, group="Measure", is_first=True)
+page_part("site", "Photosite", order=30, group="See", is_wide=True)
 page_part("goal", "Goal seek", order=97)
 page_part("sweep", "Sweep", order=98)
 page_part("steps", "Steps", order=100)
-page_part("summary", "Summary", order=110, is_first=True)
+page_part("summary", "Summary", order=110, group="Measure", is_first=True)
 page_part("variants", "Variants", order=125)
-page_part("selection", "Selection", order=120)
+page_part("selection", "Selection", order=120, group="See")
 
 
 def summary_of(result: Simulated) -> dict[str, Any]:

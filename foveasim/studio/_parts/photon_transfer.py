@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from foveasim._core.quantities import format_quantity
 from foveasim._core.validation import Floats
 from foveasim.sensor import NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise
@@ -20,7 +21,7 @@ LOWEST_E, HIGHEST = 0.1, 4.0
 SEPARATE = PHOTON_SHOT, QUANTISATION = "photon_shot", "quantisation"
 
 
-@part("Photon transfer", pinned_of, order=60)
+@part("Photon transfer", pinned_of, order=60, group="Measure")
 def photon_transfer(result: Simulated) -> PartData:
     """Return noise against signal of the photosite of median charge."""
     sensor, capture, exposure_s = result.shot.camera.sensor, result.capture, result.shot.exposure_s
@@ -48,7 +49,8 @@ def photon_transfer(result: Simulated) -> PartData:
     x, y = float(now.signal_e[0]), float(now.noise_e[0])
     about["marks"] = [{"x": x, "y": y}] if min(x, y) > 0.0 and curves else []
     about["note"] = (
-        f"Photosite {site:,}, {float(now.gain_dn_per_e.flat[0]):.3g} DN/e-, full range {full_range_e(copies):,.0f} e-"
+        f"Photosite {site:,}, {format_quantity(float(now.gain_dn_per_e.flat[0]), 'DN/e-', digits=3)}, "
+        f"full range {format_quantity(full_range_e(copies), 'e-')}"
         f"{'; now saturated' if now.is_saturated[0] else ''}{saturation_of(result)}"
     )
     return about, arrays
@@ -77,7 +79,7 @@ def _pinned_curves(result: Simulated) -> PartData:
         now = signal_to_noise(copies.part(slice(0, 1)), capture.expected_e[[site]], dark_e[:1], exposure_s=exposure_s)
         if min(float(now.signal_e[0]), float(now.noise_e[0])) > 0.0:
             marks.append({"x": float(now.signal_e[0]), "y": float(now.noise_e[0]), "name": label_of(site)})
-        notes.append(f"{site:,}: full range {full_range_e(copies):,.0f} e-")
+        notes.append(f"{site:,}: full range {format_quantity(full_range_e(copies), 'e-')}")
     labels = [label_of(site) for site in result.pinned]
     about, arrays = curves_of([{"label": n, "name": n, "unit_x": "e-", "unit_y": "e-"} for n in labels], x, y)
     return about | {"marks": marks, "note": "; ".join(notes) + saturation_of(result)}, arrays

@@ -23,7 +23,7 @@ def _lens_of(result: Simulated) -> tuple[Any, ...]:
     return result.capture.layout, camera.optics, camera.distortion, result.shot.scene, numbers
 
 
-@part("Point spread", _lens_of, order=82, is_lazy=True)
+@part("Point spread", _lens_of, order=82, group="See", is_lazy=True)
 def psf(result: Simulated) -> PartData:
     """Return sections of the PSF at pinned photosites, or nearest and farthest from the axis."""
     camera, source = result.shot.camera, result.shot.scene

@@ -61,6 +61,8 @@ class Part:
         Whether the part is not computed for previews either.
     is_of_variants : bool
         Whether the part is computed only when there are variants to compare with.
+    group : str
+        Group of the tab: "See", "Measure", "Check" or "Explore".
     work_ahead : function of Shot
         Starts work that depends on the layout before the shot is simulated.
     """
@@ -75,6 +77,7 @@ class Part:
     is_lazy: bool = False
     is_costly: bool = False
     is_of_variants: bool = False
+    group: str = "Explore"
     work_ahead: Callable[[Shot], None] | None = None
 
     __repr__ = short_repr
@@ -89,6 +92,7 @@ class Part:
         return {
             "name": self.name,
             "label": self.label,
+            "group": self.group,
             "is_tile": self.order >= FIRST_TILE,
             "is_first": self.is_first,
             "is_wide": self.is_first or self.is_wide,

@@ -24,7 +24,7 @@ def saturated_fraction(requirement: Requirement, result: Simulated) -> float:
     return result_of(replace(requirement, measure="saturated_fraction"), result.shot, result.capture)
 
 
-@part("Requirements", lambda result: (result.capture, result.shot.requirements), order=95)
+@part("Requirements", lambda result: (result.capture, result.shot.requirements), order=95, group="Check")
 def requirements(result: Simulated) -> PartData:
     """Return the requirements with their results, and the results that can be limited."""
     rows: list[dict[str, Any]] = []

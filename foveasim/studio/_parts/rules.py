@@ -11,6 +11,7 @@ from foveasim.layout import Layout
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.ahead import MANY_SITES, Ahead
 from foveasim.studio._parts.registry import PartData, part
+from foveasim.studio._settings.labels import words_of
 from foveasim.view.web._content import rules_of
 
 
@@ -23,6 +24,7 @@ def _start(shot: Shot) -> None:
     "Design rules",
     lambda result: (result.capture.layout, result.shot.rules),
     order=90,
+    group="Check",
     is_wide=True,
     work_ahead=_start,
 )
@@ -33,7 +35,11 @@ def rules(result: Simulated) -> PartData:
     arrays: dict[str, NDArray[Any]] = {}
     report = _check(result.capture.layout, result.shot.rules)
     repairs = list(result.capture.layout.provenance.get("repairs", []))
-    return {"rules": rules_of(report, arrays), "is_satisfied": bool(report.ok), "repairs": repairs}, arrays
+    found = [
+        {**rule, "name": words_of(f"rules.{rule['name']}", {}).label or rule["name"]}
+        for rule in rules_of(report, arrays)
+    ]
+    return {"rules": found, "is_satisfied": bool(report.ok), "repairs": repairs}, arrays
 
 
 _check = Ahead(Layout.check)

@@ -18,7 +18,7 @@ from foveasim.studio._parts.registry import PartData, curves_of, label_of, part,
 LOWEST_DB = -10.0
 
 
-@part("SNR", pinned_of, order=70, is_wide=True)
+@part("SNR", pinned_of, order=70, group="Measure", is_wide=True)
 def snr(result: Simulated) -> PartData:
     """Return the SNR against exposure of pinned photosites, or the median one of each filter."""
     sensor, capture, exposure_s = result.shot.camera.sensor, result.capture, result.shot.exposure_s

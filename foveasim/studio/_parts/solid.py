@@ -20,7 +20,7 @@ STACKS = (
 )
 
 
-@part("3D", layout_of, order=10, is_costly=True)
+@part("3D", layout_of, order=10, group="See", is_costly=True)
 def solid(result: Simulated) -> PartData:
     """Return the layers of the sensor: silicon, trenches, colour filters, microlenses."""
     layout = result.capture.layout

@@ -18,7 +18,7 @@ RANGES_NM = ((350.0, 1000.0), (400.0, 1000.0), (380.0, 780.0), (400.0, 700.0))
 N_WAVELENGTHS = 131
 
 
-@part("Spectrum", lambda result: (result.shot.camera.sensor,), order=50)
+@part("Spectrum", lambda result: (result.shot.camera.sensor,), order=50, group="See")
 def spectrum(result: Simulated) -> PartData:
     """Return the spectral response of each filter, electrons per photon."""
     wavelength_nm, e_per_j = _responsivity(result)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from foveasim._core.calls import Words
+from foveasim._core.validation import words_and_unit
+
+#: Names of settings in messages: a path before a colon, the name of what must be something, and quoted names with a unit.
+NAMES = re.compile(r"^([a-z]\w*(?:\.\w+)*)(?=: )|'([a-z]\w*)'(?= must)|'([a-z]\w*)'")
 
 #: Words by the last name of a setting, or by its last two for a name with several meanings.
 WORDS: dict[str, Words] = {
@@ -20,7 +25,7 @@ WORDS: dict[str, Words] = {
         synonyms="adc resolution bit depth quantisation dynamic range",
     ),
     "by_um": Words("displacement", "Displacement of the sites along x and y."),
-    "capacitance_f": Words("sense-node capacitance", synonyms="conversion gain full well"),
+    "capacitance_f": Words("sense-node capacitance", synonyms="gain,conversion gain,system gain,full well"),
     "cds": Words("correlated double sampling", synonyms="cds reset noise"),
     "coma_um": Words(help="Path difference of the coma at the edge of the aperture and of the field."),
     "companding": Words(
@@ -66,7 +71,7 @@ WORDS: dict[str, Words] = {
     "fit": Words("framing", synonyms="fit cover crop size format"),
     "focal_length_mm": Words("focal length", "Focal length of the lens.", synonyms="zoom fov"),
     "focus_distance_m": Words("focus distance", synonyms="defocus blur sharpness"),
-    "fovea": Words("filling of the fovea", synonyms="blind spot centre"),
+    "fovea": Words("filling of the fovea", synonyms="fovea,blind spot,centre hole"),
     "fov_um": Words("field diameter"),
     "fractions": Words("frequencies of the filters"),
     "from_nm": Words("cut-on wavelength"),
@@ -116,29 +121,33 @@ WORDS: dict[str, Words] = {
         help="Luminance of white, instead of the radiance.", synonyms="light brightness display nit photometric"
     ),
     "max_data_rate_gbit_per_s": Words(
-        "largest data rate", "Largest data rate of one lane; requires a readout.", "Gbit/s", "bandwidth"
+        "maximum data rate", "Largest data rate of one lane; requires a readout.", "Gbit/s", "bandwidth"
     ),
-    "max_density": Words("largest fill factor", "Largest fill factor of every window."),
-    "max_gap_um2": Words("largest gap"),
+    "max_density": Words("maximum fill factor", "Largest fill factor of every window."),
+    "max_gap_um2": Words("maximum gap"),
     "max_growth": Words(
-        "largest growth", "Largest ratio of the mean site size of a ring to that of the next inner ring."
+        "maximum growth", "Largest ratio of the mean site size of a ring to that of the next inner ring."
     ),
-    "max_neighbour_ratio": Words("largest ratio of neighbours"),
-    "max_overlap_um2": Words("largest overlap"),
-    "max_sites": Words("most photosites"),
-    "max_aspect_ratio": Words("largest aspect ratio"),
-    "max_size_um": Words("largest size", "Largest size of a site, the square root of its area.", synonyms="pixel"),
-    "max_track_utilisation": Words("largest track utilisation", synonyms="routing"),
-    "min_angle_deg": Words("smallest angle"),
-    "min_area_um2": Words("smallest area"),
-    "min_density": Words("smallest fill factor", "Smallest fill factor of every window."),
+    "max_neighbour_ratio": Words("maximum ratio of neighbours"),
+    "max_overlap_um2": Words("maximum overlap"),
+    "max_sites": Words("maximum number of photosites"),
+    "max_aspect_ratio": Words("maximum aspect ratio"),
+    "max_size_um": Words(
+        "maximum site size", "Largest size of a site, the square root of its area.", synonyms="largest site,pixel"
+    ),
+    "max_track_utilisation": Words("maximum track utilisation", synonyms="routing"),
+    "min_angle_deg": Words("minimum angle"),
+    "min_area_um2": Words("minimum area"),
+    "min_density": Words("minimum fill factor", "Smallest fill factor of every window."),
     "min_growth": Words(
-        "smallest growth", "Smallest ratio of the mean site size of a ring to that of the next inner ring."
+        "minimum growth", "Smallest ratio of the mean site size of a ring to that of the next inner ring."
     ),
-    "min_hole_um2": Words("smallest hole"),
-    "min_size_um": Words("smallest size", synonyms="pixel blind spot"),
-    "min_space_um": Words("smallest space", synonyms="gap distance"),
-    "min_width_um": Words("smallest width"),
+    "min_hole_um2": Words("minimum hole"),
+    "min_size_um": Words(
+        "smallest site", synonyms="minimum size,smallest size,pixel size,site size,fovea resolution blind spot"
+    ),
+    "min_space_um": Words("minimum space", synonyms="gap distance"),
+    "min_width_um": Words("minimum width"),
     "mosaic": Words("mosaic", synonyms="bayer rggb quad x-trans cfa colour filter array"),
     "move_um": Words("layout position", synonyms="shift translate"),
     "n_across": Words("diameter in smallest sites"),
@@ -203,7 +212,9 @@ WORDS: dict[str, Words] = {
         "sites with RTS noise", "Fraction of sites with a random telegraph signal (RTS).", synonyms="telegraph"
     ),
     "rules": Words("design rules", synonyms="drc violations"),
-    "rules.min_size_um": Words("smallest size", "Smallest size of a site, the square root of its area."),
+    "rules.preset": Words("preset of the rules"),
+    "scene.pitch_um": Words("pixel pitch"),
+    "rules.min_size_um": Words("minimum site size", "Smallest size of a site, the square root of its area."),
     "rules.grid_um": Words("manufacturing grid"),
     "scene": Words("scene", synonyms="photograph chart cube light"),
     "seed": Words("seed of the noise", "Seed of the temporal noise: equal seeds give equal noise.", synonyms="random"),
@@ -244,3 +255,15 @@ def words_of(key: str, node: Mapping[str, Any]) -> Words:
         return Words(**node["words"])
     names = [name for name in key.split(".") if not name.isdecimal()]
     return WORDS.get(".".join(names[-2:])) or WORDS.get(names[-1]) or Words()
+
+
+def worded(text: str) -> str:
+    """Return a message with the words of the controls: ``Exposure (exposure_s): must be ...``."""
+
+    def with_words(found: re.Match[str]) -> str:
+        key = found[1] or found[2] or found[3]
+        words, unit = words_and_unit(key.rpartition(".")[2])
+        label = words_of(key, {}).label or (words if unit else "")
+        return found[0] if label in ("", key) or (found[3] and not unit) else f"{label[0].upper()}{label[1:]} ({key})"
+
+    return NAMES.sub(with_words, text)

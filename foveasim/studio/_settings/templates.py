@@ -69,7 +69,7 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "kernel kind": {"kernel": [[0.0, 0.01, 0.0], [0.01, 0.96, 0.01], [0.0, 0.01, 0.0]]},
     "lateral colour": {"wavelength_nm": [450.0, 550.0, 650.0], "magnification": [0.999, 1.0, 1.001]},
     "letter_f kind": {"height_mm": 150.0},
-    "log_polar parameters": {"n_sectors": 128, "min_size_um": 3.0, "r_max_um": 600.0},
+    "log_polar parameters": {"n_sectors": 128, "min_size_um": 3.0, "r_max_um": 600.0, "fovea": "rings"},
     "merge_small kind": {"min_size_um": 2.0},
     "mosaic kind": {"block": ["RG", "GB"]},
     "octagonal parameters": {"n_x": 100, "n_y": 100, "pitch_um": 10.0},

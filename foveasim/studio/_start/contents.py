@@ -6,21 +6,21 @@ from typing import Any
 
 from foveasim._io.yaml_files import first_comment
 from foveasim.layout import LAYOUTS, MOSAICS, OPTICAL_FORMATS
-from foveasim.layout.generator_fields import RECTANGULAR
 from foveasim.layout.generator_registry import summary_of
 from foveasim.sensor import PRESETS
 from foveasim.studio._engine import MAX_SITES
 from foveasim.studio._files import Files, preset_paths, presets, thumbnail_name
 from foveasim.studio._settings.templates import has_mosaic
-from foveasim.studio._start.new_sensor import BAYER, electronics, generators, mosaics
+from foveasim.studio._start import new_sensor as sensors
 from foveasim.studio._start.recent import recent_files
 
 #: Initial choices of a new sensor.
 INITIAL = {
     "generator": "log_polar",
     "format": "1/3",
-    "n_sites": 12_000,
-    "filters": BAYER,
+    "n_sites": sensors.N_SITES,
+    "frames_per_s": sensors.FRAMES_PER_S,
+    "filters": sensors.BAYER,
     "electronics": "machine_vision",
 }
 
@@ -34,7 +34,7 @@ def contents_of(files: Files) -> dict[str, Any]:
     directories = files.kept_directories
     return {
         "presets": [_with_description(each) for each in presets()],
-        "generators": [_generator(name) for name in generators()],
+        "generators": [_generator(name) for name in sensors.generators()],
         "formats": [
             {
                 "name": name,
@@ -44,10 +44,15 @@ def contents_of(files: Files) -> dict[str, Any]:
             }
             for name, each in OPTICAL_FORMATS.items()
         ],
-        "mosaics": [{"name": name, "label": _mosaic_label(name)} for name in mosaics()],
+        "mosaics": [{"name": name, "label": _mosaic_label(name)} for name in sensors.mosaics()],
         "electronics": [
-            {"name": name, "label": each.title, "source": each.source, "scaling": each.scaling}
-            for name, each in ((name, PRESETS[name]) for name in electronics())
+            {
+                "name": name,
+                "label": PRESETS[name].title,
+                "source": PRESETS[name].source,
+                "scaling": PRESETS[name].scaling,
+            }
+            for name in sensors.electronics()
         ],
         "initial": INITIAL,
         "max_sites": MAX_SITES,
@@ -66,14 +71,14 @@ def _generator(name: str) -> dict[str, Any]:
         "name": name,
         "label": name.replace("_", " "),
         "text": f"{text[:1].upper()}{text[1:]}.",
-        "fills_format": name in RECTANGULAR,
+        "fills_format": name in sensors.RECTANGULAR,
         "has_mosaic": has_mosaic(name),
     }
 
 
 def _mosaic_label(name: str) -> str:
     """Return the name and the size of a mosaic."""
-    if name == BAYER:
+    if name == sensors.BAYER:
         return f"Bayer, {name}"
     block = MOSAICS[name]
     return f"{name.replace('_', ' ')}, {len(block[0])} × {len(block)}"

@@ -1,4 +1,4 @@
-"""New sensors from a generator, a format, a number of photosites, filters and electronics."""
+"""New sensors from a generator, requirements, filters and electronics."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foveasim._core.quantities import format_quantity
 from foveasim._core.validation import check_choice, check_length_um
 from foveasim.config import build_shot
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import LAYOUTS, MOSAICS, Layout
 from foveasim.layout.generator_fields import RECTANGULAR, rounded_down, with_field, with_scale
+from foveasim.scene import Scene
 from foveasim.sensor import PRESETS
-from foveasim.studio._files import with_covering_scene, with_layout
+from foveasim.studio._engine import MAX_SITES
+from foveasim.studio._files import with_covering_scene, with_layout, without_gaze
 from foveasim.studio._messages.models import NewSensor, handles
 from foveasim.studio._settings.changes import choose_preset, match_filters
 from foveasim.studio._settings.templates import templates
@@ -30,6 +34,10 @@ SITE_LENGTHS = {"giotto": ("unit_um",), "log_polar": ("min_size_um",)}
 RATIOS = {"foveal_cartesian": ("ring_ratio",)}
 #: Significant digits of the design rule for the smallest photosite.
 RULE_DIGITS = 3
+#: Number of photosites and frame rate where none is given, and shape of a sensor without a format.
+N_SITES, FRAMES_PER_S, SHAPE = 12_000, 30.0, (math.sqrt(4 / 3), math.sqrt(3 / 4))
+#: Relative difference of the smallest site from the required one, and number of layouts that are tried.
+TOLERANCE, MAX_TRIES = 0.05, 8
 #: Parameters of the range of the ADC.
 RANGE = {"capacitance_f", "v_sat_v"}
 #: Filters of mosaics that sensors have by name, their letters, and the mosaic with red at the top left.
@@ -61,8 +69,8 @@ def new_sensor(session: Session, message: NewSensor) -> dict[str, Any]:
     Return settings with a new sensor, which the scene covers; its exposure is automatic.
 
     Optics, scene and seed remain. The centre of the sensor is at that of the image. Raises ParameterError when a name is
-    unknown, or the generator cannot have this number of photosites. Raises SimulationError when the scene has a size that
-    cannot change.
+    unknown, or the generator cannot have this number of photosites. Raises SimulationError when the requirements contradict
+    each other, or the scene has a size that cannot change.
     """
     settings = session.history.settings
     session.check("solving for the number of photosites")
@@ -70,10 +78,11 @@ def new_sensor(session: Session, message: NewSensor) -> dict[str, Any]:
     mosaic = message.filters
     if mosaic is not None:
         check_choice("filters", mosaic, mosaics())
-    size_um = [check_length_um("size_um", length_um) for length_um in message.size_um]
-    found = with_layout(settings, _layout(generator, size_um, message.n_sites, settings))
-    found.pop("gaze_um", None)
-    found["scene"].pop("gaze_range_um", None)
+    size_um = None if message.size_um is None else [check_length_um("size_um", each_um) for each_um in message.size_um]
+    min_size_um = _min_size_um(session, message)
+    is_most = message.n_sites is None
+    section = _layout(generator, size_um, _n_sites(message), min_size_um, settings, is_most=is_most)
+    found = with_layout(without_gaze(settings), section)
     found["sensor"] = {
         **(found.get("sensor") or {}),
         "preset": check_choice("electronics", message.electronics, electronics()),
@@ -89,7 +98,106 @@ def new_sensor(session: Session, message: NewSensor) -> dict[str, Any]:
     return found
 
 
-def _layout(generator: str, size_um: Sequence[float], n_sites: int, settings: Mapping[str, Any]) -> dict[str, Any]:
+def _min_size_um(session: Session, message: NewSensor) -> float | None:
+    """Return the required size of the smallest site, also from the angular resolution on the axis of the lens."""
+    if message.sites_per_deg is None:
+        return message.min_size_um
+    shot = session.required_result("new_sensor").shot
+    distance_mm = shot.camera.optics.focal_length_mm
+    if isinstance(shot.scene, Scene):
+        distance_mm = 1e3 * shot.camera.optics.magnification(shot.scene.distance_m) * shot.scene.distance_m
+    per_deg_um = 1e3 * distance_mm * math.tan(math.radians(1.0))
+    size_um, least_um = per_deg_um / message.sites_per_deg, message.min_size_um
+    if least_um is not None and size_um < least_um:
+        raise SimulationError(
+            f"{message.sites_per_deg:g} sites per degree require sites of {_um(size_um)} with this lens, smaller than the "
+            f"smallest site of {_um(least_um)}: possible are {per_deg_um / least_um:.4g} sites per degree"
+        )
+    return size_um if least_um is None else least_um
+
+
+def _n_sites(message: NewSensor) -> int | None:
+    """Return the required number of photosites, or the largest one for the data rate."""
+    if message.pixels_per_s is None:
+        return message.n_sites
+    frames_per_s = message.frames_per_s or FRAMES_PER_S
+    most = max(1, int(min(message.pixels_per_s / frames_per_s, MAX_SITES)))
+    if message.n_sites is not None and message.n_sites > most:
+        raise SimulationError(
+            f"{message.n_sites:,} photosites exceed the data rate: possible are {most:,} at {frames_per_s:g} frames/s, or "
+            f"{message.pixels_per_s / message.n_sites:.3g} frames/s"
+        )
+    return message.n_sites or most
+
+
+def _layout(
+    generator: str,
+    size_um: Sequence[float] | None,
+    n_sites: int | None,
+    min_size_um: float | None,
+    settings: Mapping[str, Any],
+    *,
+    is_most: bool = False,
+) -> dict[str, Any]:
+    """
+    Return the section of a layout that follows from what is given, with the design rules that it satisfies.
+
+    ``is_most``: whether fewer photosites are possible, too.
+    """
+    if min_size_um is None:
+        if size_um is None:
+            raise SimulationError("the size of the sensor is not determined; give a format, or the smallest site")
+        return _filled(generator, size_um, n_sites or N_SITES, settings)
+    if size_um is None:
+        n_sites = n_sites or N_SITES
+        size_um = [min_size_um * math.sqrt(n_sites) * side for side in SHAPE]
+        factor = min_size_um / _filled(generator, size_um, n_sites, settings)["rules"]["min_size_um"]
+        return _filled(generator, [factor * each_um for each_um in size_um], n_sites, settings)
+
+    (width_um, height_um), least_um = size_um, min_size_um
+
+    def contradiction(n_wanted: int, *possible: tuple[int, float]) -> SimulationError:
+        names = ", or ".join(f"{n:,} of {_um(each_um)}" for n, each_um in possible)
+        return SimulationError(
+            f"{generator.replace('_', ' ')} in {1e-3 * width_um:.4g} × {1e-3 * height_um:.4g} mm cannot have {n_wanted:,} "
+            f"photosites of {_um(least_um)}: possible are {names}"
+        )
+
+    area_um2 = math.prod(size_um) if generator in RECTANGULAR else 0.25 * math.pi * min(size_um) ** 2
+    n_most = round(area_um2 / min_size_um**2)
+    n_sites = None if is_most and (n_sites or 0) > n_most else n_sites
+    n_wanted = n_sites or (n_most if generator in RECTANGULAR else 0)
+    if n_wanted > min((1.0 + 2.0 * TOLERANCE) * n_most, MAX_SITES):
+        n_possible = min(n_wanted, MAX_SITES)
+        other = [(n_most, min_size_um)] if n_most < n_wanted else []
+        raise contradiction(n_wanted, *other, (n_possible, math.sqrt(area_um2 / n_possible)))
+    if generator == "log_polar":
+        given = templates("log_polar parameters") | {"min_size_um": min_size_um, "r_max_um": 0.5 * min(size_um)}
+        section = {"generator": generator, "parameters": _with_sectors(given, n_sites) if n_sites else given}
+        n_built = _built(section, settings).n_sites
+        if n_sites and abs(n_built / n_sites - 1.0) > TOLERANCE:
+            raise contradiction(n_sites, (n_built, min_size_um))
+        return _with_rules(section, settings)
+    n_tried = n_wanted or min(n_most, N_SITES)
+    for _ in range(1 if n_sites else MAX_TRIES):
+        section = _filled(generator, size_um, max(1, n_tried), settings)
+        ratio = section["rules"]["min_size_um"] / min_size_um
+        if abs(ratio - 1.0) <= TOLERANCE:
+            return section
+        n_tried = round(n_tried * ratio**2)
+    n_built = _built(section, settings).n_sites
+    other = []
+    if n_sites:
+        n_possible = _built(_layout(generator, size_um, None, min_size_um, settings), settings).n_sites
+        other = [(n_possible, min_size_um)]
+    raise contradiction(n_sites or n_most, *other, (n_built, ratio * min_size_um))
+
+
+def _um(length_um: float) -> str:
+    return format_quantity(length_um, "µm", digits=3)
+
+
+def _filled(generator: str, size_um: Sequence[float], n_sites: int, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the section of a layout in a format, with the design rules that it satisfies."""
     if generator in RECTANGULAR:
         parameters = with_field(generator, templates(f"{generator} parameters"), size_um, size_um)
@@ -98,6 +206,10 @@ def _layout(generator: str, size_um: Sequence[float], n_sites: int, settings: Ma
         section = _solved(generator, _refined(generator, n_sites), n_sites)
         factor = 0.5 * min(size_um) / float(np.abs(_built(section, settings).bounds_um).max())
         section["parameters"] = with_scale(section["parameters"], factor, 0.5 * min(size_um))
+    return _with_rules(section, settings)
+
+
+def _with_rules(section: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
     min_size_um = float(_built(section, settings).size_um.min())
     return {**section, "rules": {"min_size_um": rounded_down(min_size_um, RULE_DIGITS), "max_overlap_um2": 0.0}}
 
@@ -126,6 +238,8 @@ def _refined(generator: str, n_sites: int) -> dict[str, Any]:
 
 def _solved(generator: str, parameters: Mapping[str, Any], n_sites: int, *, is_resized: bool = True) -> dict[str, Any]:
     """Return the section of a generator that solves for a number of photosites."""
+    if generator == "log_polar":  # an integer, which later builds need not solve for again
+        return {"generator": generator, "parameters": _with_sectors(parameters, n_sites)}
     unknown, initial = _unknown(generator), _initial(generator)
     given = {name: value for name, value in parameters.items() if name != INSTEAD_OF.get(unknown or "")}
     if initial is None:
@@ -134,6 +248,22 @@ def _solved(generator: str, parameters: Mapping[str, Any], n_sites: int, *, is_r
     found: dict[str, Any] = with_n_sites({"layout": section}, n_sites, initial, unknown, is_resized=is_resized)[
         "layout"
     ]
+    return found
+
+
+def _with_sectors(parameters: Mapping[str, Any], n_sites: int) -> dict[str, Any]:
+    """Return parameters of log-polar rings with the number of sectors for about a number of photosites."""
+    found, n_sectors = dict(parameters), parameters["n_sectors"]
+    for _ in range(MAX_TRIES):
+        try:
+            n_built = LAYOUTS["log_polar"](**{**found, "n_sectors": n_sectors}).n_sites
+        except ParameterError:  # more sectors than the field has room for
+            n_sectors = (found["n_sectors"] + n_sectors) // 2
+            continue
+        found["n_sectors"] = n_sectors
+        n_sectors = max(3, round(n_sectors * math.sqrt(n_sites / n_built)))
+        if n_sectors == found["n_sectors"]:
+            break
     return found
 
 

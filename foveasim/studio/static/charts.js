@@ -6,6 +6,7 @@ import { inkOf, make } from "/web/page_parts.js";
 import { listenToRange } from "/web/shell.js";
 import { addFiles } from "./chart_files.js";
 import { sizeOf } from "./frames.js";
+import { quantity, unitText } from "./numbers.js";
 import { fitted } from "./site_pane.js";
 
 const SVG = "http://www.w3.org/2000/svg";
@@ -22,7 +23,7 @@ const DASHES = [[], [7, 3], [2, 2.5], [9, 3, 2, 3], [4, 3], [1, 4]];
 
 const theme = () => (document.documentElement.dataset.theme === "dark" ? 1 : 0);
 const inkOfCurve = (curve, k) => (NAMED[curve.name] || INKS[k % INKS.length])[theme()];
-export const axisTitle = (name, unit) => (unit ? name + " / " + unit : name);
+export const axisTitle = (name, unit) => (unit ? name + " / " + unitText(unit) : name);
 
 function ticksOf(low, high, most) {
   const step = roundStep((high - low) / most), ticks = [];
@@ -109,7 +110,7 @@ export class CurveChart {
   // "point" for a small dot, else a dot; vertical lines: [{ x, label, of }].
   use(curves, { marks = [], lines = [], note = "" } = {}) {
     Object.assign(this, { curves, marks, lines });
-    this.note.textContent = note;
+    this.note.textContent = unitText(note);
     this.note.hidden = !note;
     const own = curves.filter((curve) => !curve.isDashed);
     this.canvas.setAttribute("aria-label", this.label + ": "
@@ -273,11 +274,11 @@ export class CurveChart {
       const value = here === null ? "" : " " + brief(Number(valueAt(curve, here).toPrecision(3)));
       const line = curve.isDashed ? null : this.lines.find((one) => one.label === curve.label);
       const text = (curve.isDashed ? "A: " : "") + curve.label + value
-        + (line && here === null ? ", " + line.of + " " + brief(Number(line.x.toPrecision(3))) : "");
+        + (line && here === null ? ", " + line.of + " " + quantity(line.x, own[0].unit_x, 3) : "");
       item.append(swatch, make("span", text));
       return item;
     });
-    if (here !== null) items.unshift(make("li", brief(Number(here.toPrecision(4))) + " " + own[0].unit_x));
+    if (here !== null) items.unshift(make("li", quantity(here, own[0].unit_x)));
     this.legend.replaceChildren(...items);
   }
 }
@@ -449,10 +450,10 @@ export function barRows(sources, others, unit) {
     if (was !== undefined) {
       const mark = make("b");
       mark.style.left = (100 * was) / most + "%";
-      mark.title = "A: " + brief(was) + " " + unit;
+      mark.title = "A: " + quantity(was, unit, 3);
       track.append(mark);
     }
-    row.append(make("span", source.label || source.name.replaceAll("_", " ")), track, make("span", brief(source.values)));
+    row.append(make("span", source.label || source.name.replaceAll("_", " ")), track, make("span", quantity(source.values, unit, 3)));
     return row;
   });
 }

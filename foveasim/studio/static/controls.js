@@ -2,7 +2,7 @@
 
 import { clamp, roundStep, shown } from "/web/colours.js";
 import { change, make } from "/web/page_parts.js";
-import { numberOf } from "./numbers.js";
+import { numberOf, unitText } from "./numbers.js";
 
 // Sections that are open at first; settings outside all sections are in the first of them.
 const OPEN = ["exposure", "layout", "optics", "sensor"];
@@ -135,7 +135,7 @@ class Row {
     this.error = make("p", undefined, "error");
     this.error.id = this.id + "-error";
     this.error.hidden = true;
-    this.unit = make("span", control.unit || "", "unit");
+    this.unit = make("span", unitText(control.unit || ""), "unit");
     if (control.kind === "group") this._buildHeading();
     else if (control.kind === "sections") this._buildAdder();
     else this._build();
@@ -146,8 +146,9 @@ class Row {
     this.field?.setAttribute("aria-label", this.name + (control.unit ? ", " + control.unit : ""));
     this.adder?.setAttribute("aria-describedby", this.help.id);
     this.root.append(this.help, this.error);
-    this.words = [control.label, control.key, control.help, control.section, control.synonyms, control.context].join(" ").toLowerCase()
-      .replaceAll("_", " ");
+    const plain = (...texts) => texts.join(" ").toLowerCase().replaceAll("_", " ");
+    this.phrases = [control.label, ...(control.synonyms || "").split(",")].map((text) => plain(text).trim());
+    this.words = plain(...this.phrases, control.key, control.help, control.section, control.context);
   }
 
   _makeField() {
@@ -176,11 +177,19 @@ class Row {
     field.autocomplete = "off";
     field.spellcheck = false;
     if (kind === "number" || kind === "integer") field.inputMode = "decimal";
-    if (control.default !== undefined && control.default !== null) field.placeholder = fieldText(control.default);
     field.addEventListener("input", () => { this.isDirty = true; this.isCurrent = false; });
     field.addEventListener("change", () => this._commit(field));
     field.addEventListener("keydown", (event) => this._key(event, field));
     return field;
+  }
+
+  // How well a row matches a search: its name, one of its other names, words at their beginning, or any words; 0 if it does not.
+  /** @param {string} text @param {string[]} words */
+  rank(text, words) {
+    if (!words.every((word) => this.words.includes(word))) return 0;
+    const [label, ...others] = this.phrases, starts = (/** @type {string} */ name) => words.every((word) => (" " + name).includes(" " + word));
+    const rank = label === text ? 5 : others.includes(text) ? 4 : starts(label) ? 3 : starts(this.phrases.join(" ")) ? 2 : 1;
+    return rank + (this.isExtra ? 0 : 0.5) + 0.4 / label.length;
   }
 
   // Sends the value of a choice, with a file and parameters that the user chooses if it requires them.
@@ -287,8 +296,10 @@ class Row {
     this.range = range;
     slider.max = String(range.steps);
     const base = Number.isFinite(value) ? value : typeof this.control.default === "number" ? this.control.default : range.toValue(0);
+    const isSet = Number.isFinite(value) || typeof this.control.default === "number";
     slider.value = String(range.toStep(base));
-    slider.setAttribute("aria-valuetext", fieldText(base) + " " + (this.control.unit || ""));
+    slider.classList.toggle("unset", !isSet);
+    slider.setAttribute("aria-valuetext", isSet ? fieldText(base) + " " + (this.control.unit || "") : "not set");
     fillTrack(slider);
   }
 
@@ -336,7 +347,7 @@ class Row {
 
   // Shows the value that the generator has solved for, or the default, where none is given.
   solve(value) {
-    const { default: initial } = this.control, text = fieldText(value ?? initial);
+    const { default: initial } = this.control, text = fieldText(value ?? initial) || "not set";
     if (this.field instanceof HTMLInputElement && this.field.type === "text" && this.field.placeholder !== text) {
       this.field.placeholder = text;
       this.field.classList.toggle("solved", value !== undefined);
@@ -372,7 +383,7 @@ class Row {
     if (control.kind === "choice") {
       const chosen = chosenOf({ ...control, choices: this.choices }, value ?? control.default);
       const other = field.querySelector("option[value='-1']");
-      if (chosen < 0 && !other) field.prepend(new Option("–", "-1"));
+      if (chosen < 0 && !other) field.prepend(new Option("not set", "-1"));
       else if (chosen >= 0) other?.remove();
       change(field, { value: String(chosen) });  // browsers examine all forms again when a choice is set
     } else if (control.kind === "boolean") Object.assign(field, { checked: Boolean(value ?? control.default) });
@@ -386,7 +397,7 @@ class Row {
 }
 
 export class Controls {
-  root; search; onlyChanged; on; hint;
+  root; search; onlyChanged; on; hint; sorted = "";
 
   // Callbacks: send(key, value, isFinal) and act(do, name) return the number of the message; reset(key), remove(key);
   // chooseFile() and chooseSection(choice), as those of rows.
@@ -453,6 +464,7 @@ export class Controls {
     }
     for (const [name, section] of this.sections) if (!groups.has(name)) { section.root.remove(); this.sections.delete(name); }
     for (const [name, rows] of groups) this._fillSection(name, rows);
+    if (this.sorted) this._sort(this.sorted, this.sorted.split(" "));
     if (focusedKey && document.activeElement !== focused) {
       const row = this.rows.get(focusedKey);
       (wasSlider && row?.slider ? row.slider : row?.field)?.focus({ preventScroll: true });
@@ -495,11 +507,25 @@ export class Controls {
       || nodes.some((node, i) => section.body.children[i] !== node)) section.body.replaceChildren(...nodes);
   }
 
+  // Orders sections and rows by how well they match; all as they are listed without a search.
+  /** @param {string} text @param {string[]} words */
+  _sort(text, words) {
+    this.sorted = text;
+    const best = [...this.sections.values()].map((section) => {
+      const ranks = new Map(section.rows.map((row) => [row, words.length ? row.rank(text, words) : 0]));
+      section.body.append(...[...section.rows].sort((a, b) => (ranks.get(b) || 0) - (ranks.get(a) || 0)).map((row) => row.root));
+      return { section, rank: Math.max(...ranks.values()) };
+    });
+    this.root.append(...best.sort((a, b) => b.rank - a.rank).map(({ section }) => section.root));
+    this.root.scrollTop = 0;
+  }
+
   _filter() {
-    const words = this.search.value.toLowerCase().split(/\s+/).filter(Boolean);
+    const words = this.search.value.toLowerCase().split(/\s+/).filter(Boolean), text = words.join(" ");
     const isOnly = this.onlyChanged.getAttribute("aria-pressed") === "true";
     const isFiltered = words.length > 0 || isOnly;
     let found = 0;
+    if (text !== this.sorted) this._sort(text, words);
     for (const section of this.sections.values()) {
       let visible = 0, extra = 0;
       for (const row of section.rows) {
@@ -508,6 +534,7 @@ export class Controls {
           && words.every((word) => row.words.includes(word)) && (!isOnly || row.root.classList.contains("changed"));
         const isShown = isFound || !row.error.hidden;
         change(row.root, { hidden: !isShown });
+        change(row.label, { textContent: words.length ? row.name : row.control.is_value ? "value" : row.control.label });
         visible += Number(isShown);
       }
       found += visible;

@@ -1,8 +1,13 @@
-// Buttons and slider of a film, for rows under the bar of a view.
+// The row under the bar of the optical image that plays videos, folders and the gaze path: step, play, time.
 
-import { make } from "/web/page_parts.js";
+import { change, make } from "/web/page_parts.js";
 
-/** @typedef {{ back: string, play: string, pause: string, forward: string, slider: string }} FilmNames */
+// What has a part of the row, to which its own elements belong: names of the buttons and the slider; its film, null for none now;
+// words of its position, also for screen readers, and a problem instead; started() is called before it plays.
+/**
+ * @typedef {{ names: { back: string, play: string, pause: string, forward: string, slider: string }, part: HTMLElement,
+ *   film: () => Film | null, words: () => string, problem?: () => string, started: () => void }} Player
+ */
 
 /** @type {(text: string, title: string, act: () => void) => HTMLButtonElement} */
 export function rowButton(text, title, act) {
@@ -13,47 +18,67 @@ export function rowButton(text, title, act) {
   return button;
 }
 
-export class FilmRow {
-  // film() returns the present film; started() is called before it plays.
-  /** @param {FilmNames} names @param {() => Film | null} film @param {() => void} started */
-  constructor(names, film, started) {
-    this.names = names;
-    this.film = film;
-    this.started = started;
-    this.back = rowButton("◂", names.back, () => this.film()?.step(-1));
-    this.play = rowButton("▶", names.play, () => this.toggle());
-    this.forward = rowButton("▸", names.forward, () => this.film()?.step(1));
+export class Transport {
+  /** @type {Player[]} */ players = [];
+
+  constructor() {
+    this.root = make("div", undefined, "film");
+    this.root.id = "transport";
+    this.root.hidden = true;
+    this.back = rowButton("◂", "", () => this.film?.step(-1));
+    this.play = rowButton("▶", "", () => this.toggle());
+    this.forward = rowButton("▸", "", () => this.film?.step(1));
     this.slider = make("input");
     Object.assign(this.slider, { type: "range", min: 0, step: 1, value: 0 });
-    this.slider.setAttribute("aria-label", names.slider);
-    this.slider.addEventListener("input", () => { this.film()?.go(Number(this.slider.value), false); this.film()?.pause(); });
-    this.slider.addEventListener("change", () => this.film()?.go(Number(this.slider.value), true));
+    this.slider.addEventListener("input", () => { this.film?.go(Number(this.slider.value), false); this.film?.pause(); });
+    this.slider.addEventListener("change", () => this.film?.go(Number(this.slider.value), true));
+    this.label = make("span", undefined, "quiet");
+    this.root.append(this.back, this.play, this.forward, this.slider, this.label);
   }
 
-  get elements() { return [this.back, this.play, this.forward, this.slider]; }
+  /** @param {Player} player */
+  add(player) {
+    this.players.push(player);
+    player.part.hidden = true;
+    this.root.append(player.part);
+  }
+
+  // The row plays the last film, unless another one is playing.
+  get player() {
+    const able = this.players.filter((one) => one.film());
+    return able.find((one) => one.film()?.isPlaying) ?? able.at(-1) ?? null;
+  }
+
+  get film() { return this.player?.film() ?? null; }
 
   toggle() {
-    const film = this.film();
+    const { player } = this, film = player?.film();
     if (film?.isPlaying) film.pause();
-    else if (film) {
-      this.started();
+    else if (player && film) {
+      player.started();
       film.play();
     }
   }
 
-  // Shows the position of a film, with its words for screen readers.
-  /** @param {Film | null} film @param {string} words */
-  show(film, words) {
-    const { back, play, forward, slider, names } = this, n = film?.n ?? 0, last = (film?.count ?? 1) - 1;
+  // Shows the positions of films.
+  show() {
+    const { back, play, forward, slider, label, player, film } = this, open = this.players.filter(({ part }) => !part.hidden);
+    change(this.root, { hidden: !open.length });
+    if (!open.length) return;
+    const { names } = player ?? open[open.length - 1], n = film?.n ?? 0, last = (film?.count ?? 1) - 1;
+    const problem = open.map((one) => one.problem?.()).find(Boolean) || "";
+    const words = problem || open.map((one) => one.words()).filter(Boolean).join(" · ");
     slider.max = String(last);
     if (!film || film.isPlaying || !film.isBusy) slider.value = String(n);
-    slider.setAttribute("aria-valuetext", words);
-    slider.disabled = last < 1;
-    play.textContent = film?.isPlaying ? "❚❚" : "▶";
-    play.title = film?.isPlaying ? names.pause : names.play;
-    play.setAttribute("aria-label", play.title);
-    play.disabled = last < 1;
-    back.disabled = n <= 0;
-    forward.disabled = n >= last;
+    const playing = film?.isPlaying ? names.pause : names.play;
+    for (const [element, name] of /** @type {[HTMLElement, string][]} */ ([[back, names.back], [play, playing], [forward, names.forward]])) {
+      change(element, { title: name, ariaLabel: name });
+    }
+    change(slider, { ariaLabel: names.slider, ariaValueText: words, disabled: last < 1 });
+    change(play, { textContent: film?.isPlaying ? "❚❚" : "▶", disabled: last < 1 });
+    change(back, { disabled: n <= 0 });
+    change(forward, { disabled: n >= last });
+    for (const each of [back, play, forward, slider]) each.hidden = !film && open.every((one) => one.part.id === "film");
+    change(label, { textContent: words, title: words, className: problem ? "quiet wrong" : "quiet" });
   }
 }

@@ -3,7 +3,7 @@
 import { clamp } from "/web/colours.js";
 import { change, download, find, make, notice, speak } from "/web/page_parts.js";
 import { Film } from "./film.js";
-import { FilmRow, rowButton } from "./film_row.js";
+import { rowButton } from "./film_row.js";
 import { GazeMarks } from "./gaze_marks.js";
 import { Recording, withChanged, withRow } from "./gaze_rows.js";
 import { GazeTable } from "./gaze_table.js";
@@ -30,9 +30,7 @@ export class GazePanel {
   /** @type {{ of: Recording, n: number, rows: GazeRow[] } | null} */ recorded = null;
   // Elements.
   /** @type {HTMLElement} */ row;
-  /** @type {HTMLElement} */ label;
   /** @type {{ [name: string]: HTMLButtonElement }} */ buttons;
-  /** @type {FilmRow} */ controls;
   /** @type {HTMLInputElement} */ chosen;
   /** @type {HTMLDialogElement} */ dialog;
   /** @type {number[] | null} */ timesS = null;
@@ -40,11 +38,12 @@ export class GazePanel {
 
   // Callbacks: connection(), state(), playing() before the path plays, redraw() of the marks.
   /**
-   * @param {HTMLElement} root @param {ImagePane} pane
+   * @param {HTMLElement} root @param {ImagePane} pane @param {import("./film_row.js").Transport} transport
    * @param {{ connection: () => Connection, state: () => State | null, playing: () => void, redraw: () => void }} on
    */
-  constructor(root, pane, on) {
+  constructor(root, pane, transport, on) {
     this.root = root;
+    this.transport = transport;
     this.pane = pane;
     this.on = on;
     this.marks = new GazeMarks(pane, {
@@ -70,25 +69,22 @@ export class GazePanel {
     toggle.id = "gaze-path";
     toggle.title = "Record, replay and edit movements of the gaze";
     find(this.root, "#follow-scene").before(toggle);
-    this.row = make("div", undefined, "film gaze");
+    this.row = make("div");
     this.row.id = "gaze";
     this.row.setAttribute("role", "group");
     this.row.setAttribute("aria-label", "Gaze path");
     const record = rowButton("Record", "", () => (this.recording ? this.finish() : this.start()));
     record.classList.add("record");
     record.title = "Record movements of the gaze: drag the outline, or use the arrow keys on the optical image";
-    this.controls = new FilmRow(NAMES, () => this.film, () => on.playing());
-    this.label = make("span", undefined, "quiet");
     const table = rowButton("Rows", "Show the rows of the gaze path", () => {
       this.table.root.hidden = !this.table.root.hidden;
       this._show();
     });
     Object.assign(this.buttons, { toggle, record, table });
-    const end = make("div", undefined, "end");
-    end.append(this.label, table, this._menu());
-    this.row.append(record, ...this.controls.elements, end);
-    this.table.root.hidden = this.row.hidden = true;
-    find(this.root, ".stage").before(this.row);
+    this.row.append(record, table, this._menu());
+    this.transport.add({ names: NAMES, part: this.row, film: () => (this.row.hidden || this.recording ? null : this.film),
+      words: () => this._words(), problem: () => (this.recording ? "" : this.error || this.problem), started: () => on.playing() });
+    this.table.root.hidden = true;
     find(this.root, ".stage").append(this.table.root);
   }
 
@@ -330,17 +326,16 @@ export class GazePanel {
   // -- display --------------------------------------------------------------------------------------------------------------------
 
   _show() {
-    const { recording, row, rows, film, buttons, label } = this, isOpen = !row.hidden, state = this.on.state();
+    const { recording, row, rows, buttons } = this, isOpen = !row.hidden, state = this.on.state();
     const isRecording = Boolean(recording), shown = recording ? this._recorded(recording) : rows;
     buttons.toggle.setAttribute("aria-pressed", String(isOpen));
     this.marks.use(shown, recording?.position ?? this.position, { isShown: isOpen && shown.length > 0, isRecording });
+    this.transport.show();
     if (!isOpen || !state) return;
-    const problem = isRecording ? "" : this.error || this.problem, words = problem || this._words(), isTableShown = !this.table.root.hidden;
+    const isTableShown = !this.table.root.hidden;
     buttons.record.setAttribute("aria-pressed", String(isRecording));
     change(buttons.record, { textContent: isRecording ? "Stop" : "Record",
       ariaLabel: isRecording ? "Stop recording the gaze" : "Record the gaze" });
-    this.controls.show(isRecording ? null : film, words);
-    change(label, { textContent: words, title: problem, className: problem ? "quiet wrong" : "quiet" });
     buttons.table.setAttribute("aria-pressed", String(isTableShown));
     for (const each of [buttons.save, buttons.clear]) each.disabled = !rows.length;
     this.table.insert.disabled = isRecording;

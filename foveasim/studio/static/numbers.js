@@ -1,4 +1,6 @@
-// Numbers as people write them: fractions, products, decimal commas, and units with metric prefixes.
+// Numbers as people write them: fractions, products, decimal commas, and units with metric prefixes; and as the page shows them.
+
+export { quantity, unitText } from "/web/colours.js";
 
 const PREFIXES = { G: 1e9, M: 1e6, k: 1e3, "": 1, c: 1e-2, m: 1e-3, µ: 1e-6, μ: 1e-6, u: 1e-6, n: 1e-9, p: 1e-12, f: 1e-15, a: 1e-18 };
 // Units that a setting can have, and those with the same dimension: prefix of the setting, and its base.

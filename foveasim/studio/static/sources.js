@@ -3,7 +3,7 @@
 import { $, make, notice } from "/web/page_parts.js";
 import { Camera, FIRST_SIZE, SIZES } from "./camera.js";
 import { Film, Rate } from "./film.js";
-import { FilmRow, rowButton } from "./film_row.js";
+import { rowButton } from "./film_row.js";
 import { listenToMenu } from "./menus.js";
 import { awaited } from "./pending.js";
 
@@ -32,13 +32,12 @@ export class Sources {
   /** @type {HTMLInputElement} */ directory;
   /** @type {HTMLElement} */ row;
   /** @type {HTMLElement} */ strip;
-  /** @type {FilmRow} */ controls;
   /** @type {HTMLSelectElement} */ size;
-  /** @type {HTMLElement} */ label;
 
   // Callbacks: connection(), state(), charts() (choices of the scene), choose() (a file), playing() before a film plays.
-  constructor(pane, on) {
+  constructor(pane, transport, on) {
     this.pane = pane;
+    this.transport = transport;
     this.on = on;
     this.camera = new Camera();
     this._build();
@@ -63,16 +62,14 @@ export class Sources {
     this.directory.setAttribute("aria-label", "Folder of pictures");
     frame.append(button, this.menu, this.directory);
     bar.insertBefore(frame, $("follow-scene"));
-    this.row = make("div", undefined, "film");
+    this.row = make("div");
     this.row.id = "film";
-    this.row.hidden = true;
     this.strip = make("div", undefined, "strip");
     this.strip.id = "strip";
     this.strip.hidden = true;
     this.strip.setAttribute("role", "group");
     this.strip.setAttribute("aria-label", "Pictures of the folder");
-    bar.after(this.row, this.strip);
-    this.controls = new FilmRow(NAMES, () => this.film, () => this.on.playing());
+    bar.after(this.transport.root, this.strip);
     this.buttons = {
       close: rowButton("✕", "Close", () => this._close()),
       camera: rowButton("Stop", "Stop the camera; its last frame stays the scene",
@@ -83,8 +80,9 @@ export class Sources {
     this.size.append(...SIZES.map((size) => { return new Option(size + " px", String(size)); }));
     this.size.value = String(FIRST_SIZE);
     this.size.addEventListener("change", () => { this.camera.size = Number(this.size.value); });
-    this.label = make("span", undefined, "quiet");
-    this.row.append(...this.controls.elements, this.buttons.camera, this.size, this.label, this.buttons.close);
+    this.row.append(this.buttons.camera, this.size, this.buttons.close);
+    this.transport.add({ names: NAMES, part: this.row, film: () => (this._isCamera ? null : this.film), words: () => this._words(),
+      started: () => this.on.playing() });
     button.addEventListener("click", () => this._fillMenu());
     listenToMenu(button, this.menu);
     this.menu.addEventListener("click", (event) => {
@@ -163,36 +161,34 @@ export class Sources {
 
   // -- display ------------------------------------------------------------------------------------------------------------------
 
+  get _isCamera() { return this.kind === "camera" || this.camera.isOn; }
+
   _show() {
-    const { film, kind, camera } = this, isCamera = kind === "camera" || camera.isOn;
-    const rate = (isCamera ? this.rate : film?.rate)?.perS ?? NaN;
-    const { camera: stop } = this.buttons;
+    const { film, kind, camera, _isCamera: isCamera, buttons: { camera: stop } } = this;
     this.row.hidden = !film && !isCamera;
     this.strip.hidden = !(this.folder && (kind === "folder"));
-    if (this.row.hidden) return;
-    for (const each of this.controls.elements) each.hidden = isCamera;
     for (const each of [stop, this.size]) each.hidden = !isCamera;
-    this.row.classList.toggle("live", camera.isOn);
-    const perS = Number.isFinite(rate) && (film?.isPlaying || camera.isOn) ? rate.toFixed(rate < 10 ? 1 : 0) + " frames/s" : "";
+    this.transport.root.classList.toggle("live", camera.isOn);
     if (isCamera) {
       stop.textContent = camera.isOn ? "Stop" : "Start";
       stop.title = camera.isOn ? "Stop the camera; its last frame stays the scene" : "Start the camera again";
       stop.setAttribute("aria-label", stop.title);
-      const size = this.about?.kind === "camera" ? this.about.width + " × " + this.about.height : "";
-      this.label.textContent = camera.isOn ? ["live", size, perS].filter(Boolean).join(" · ") : "camera stopped, last frame";
-      return;
-    }
-    if (!film) return;
-    const total = String(film.count);
-    this.controls.show(film, "Frame " + (film.n + 1) + " of " + total);
-    const name = kind === "folder" ? this.folder?.[film.n]?.file.name : this.about?.name;
-    this.label.textContent = String(film.n + 1).padStart(total.length, "\u2007") + " / " + total + (perS ? " · " + perS : "");
-    this.label.title = name || "";
-    if (kind === "folder") [...this.strip.children].forEach((cell, k) => {
+    } else if (film && kind === "folder") [...this.strip.children].forEach((cell, k) => {
       const isCurrent = k === film.n;
       if (isCurrent && cell.getAttribute("aria-current") !== "true") cell.scrollIntoView({ block: "nearest", inline: "nearest" });
       cell.setAttribute("aria-current", String(isCurrent));
     });
+    this.transport.show();
+  }
+
+  // The frame, or the size of the camera, with the rate.
+  _words() {
+    const { film, camera, about, _isCamera: isCamera } = this, rate = (isCamera ? this.rate : film?.rate)?.perS ?? NaN;
+    const perS = Number.isFinite(rate) && (film?.isPlaying || camera.isOn) ? rate.toFixed(rate < 10 ? 1 : 0) + " frames/s" : "";
+    const size = about?.kind === "camera" ? about.width + " × " + about.height : "";
+    if (isCamera) return camera.isOn ? ["live", size, perS].filter(Boolean).join(" · ") : "camera stopped, last frame";
+    const total = String(film?.count);
+    return film ? String(film.n + 1).padStart(total.length, "\u2007") + " / " + total + (perS ? " · " + perS : "") : "";
   }
 
   // Closes the row; the current frame stays the scene.
@@ -201,7 +197,7 @@ export class Sources {
     this.film?.pause();
     this.film = this.kind = null;
     if (this.folder) this._forgetFolder();
-    this.row.hidden = this.strip.hidden = true;
+    this._show();
     $("source").focus();
   }
 

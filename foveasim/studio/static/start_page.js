@@ -2,13 +2,21 @@
 
 import { shown } from "/web/colours.js";
 import { $, make, notice } from "/web/page_parts.js";
-import { numberOf } from "./numbers.js";
+import { numberOf, quantity } from "./numbers.js";
 import { awaited } from "./pending.js";
 
 // Storage of the choice not to show the page at start.
 const STORED = "foveasim-studio-start", NEVER = "never";
-const OWN_SIZE = "own";
+// Choices of the format: none, and an own one.
+const ANY_SIZE = "any", OWN_SIZE = "own";
+// Requirements that may be left open, with their names in messages of the page, and factors to the units of the server.
+/** @type {[string, string, string, number][]} */
+const REQUIREMENTS = [["start-smallest", "Smallest site", "min_size_um", 1], ["start-angle", "Sites per degree", "sites_per_deg", 1],
+  ["start-rate", "Data rate", "pixels_per_s", 1e6], ["start-frames", "Frames per second", "frames_per_s", 1]];
 const MM_PER_UM = 1e-3;
+
+/** @type {(id: string, name: string) => number} */
+const givenOf = (id, name) => numberOf($(id).value, name.endsWith("_um") ? "µm" : "");
 
 const stored = {
   get isNever() { try { return localStorage.getItem(STORED) === NEVER; } catch { return false; } },
@@ -107,10 +115,12 @@ export class StartPage {
       $(id).replaceChildren(...presets.filter(({ kind }) => kind === wanted).map(cardOf));
     }
     fill("start-generator", generators, initial.generator);
-    fill("start-format", [...formats, { name: OWN_SIZE, label: "own size" }], initial.format);
+    fill("start-format", [...formats, { name: OWN_SIZE, label: "own size" }, { name: ANY_SIZE, label: "follows from the requirements" }], initial.format);
     fill("start-filters", [{ name: "", label: "none" }, ...mosaics], initial.filters);
     fill("start-electronics", electronics, initial.electronics);
-    $("start-sites").value = String(initial.n_sites);
+    $("start-sites").placeholder = shown(initial.n_sites);
+    $("start-frames").placeholder = shown(initial.frames_per_s);
+    for (const id of ["start-smallest", "start-angle", "start-rate"]) $(id).placeholder = "not set";
   }
 
   get _format() { return this.contents?.formats.find(({ name }) => name === $("start-format").value); }
@@ -120,10 +130,10 @@ export class StartPage {
     if (!this.contents) return;
     const { generators, electronics } = this.contents, format = this._format;
     const generator = generators.find(({ name }) => name === $("start-generator").value);
-    const shorter = shown(Math.min(...this._size()));
+    const shorter = shown(Math.min(...(this._size() ?? [NaN])));
     const place = generator?.fills_format ? "Fills the format."
       : "Inscribed in the shorter side of the format" + (Number(shorter) > 0 ? ": " + shorter + " × " + shorter + " mm." : ".");
-    $("start-own").hidden = Boolean(format);
+    $("start-own").hidden = $("start-format").value !== OWN_SIZE;
     $("start-generator-hint").textContent = generator ? generator.text + " " + place : "";
     $("start-format-hint").textContent = format ? "Source: " + format.source + "." : "";
     $("start-filters-hint").textContent = $("start-filters").value && !generator?.has_mosaic
@@ -132,17 +142,20 @@ export class StartPage {
     $("start-electronics-hint").textContent = found ? found.scaling + " Source: " + found.source + "." : "";
   }
 
-  // Width and height of the chosen format in mm.
+  // Width and height of the chosen format in mm; null if they follow.
   _size() {
     const format = this._format;
+    if ($("start-format").value === ANY_SIZE) return null;
     if (format) return format.size_um.map((length) => MM_PER_UM * length);
     return [$("start-width"), $("start-height")].map(({ value }) => numberOf(value, "mm"));
   }
 
   _problem() {
-    const n = numberOf($("start-sites").value), most = this.contents?.max_sites ?? Infinity;
-    if (!this._size().every((length) => length > 0)) return "Width and height must be positive numbers.";
-    return Number.isInteger(n) && n >= 1 && n <= most ? "" : "Photosites must be an integer from 1 to " + shown(most) + ".";
+    const text = $("start-sites").value.trim(), n = numberOf(text), most = this.contents?.max_sites ?? Infinity;
+    if (!this._size()?.every((length) => length > 0) && $("start-format").value !== ANY_SIZE) return "Width and height must be positive numbers.";
+    if (text && !(Number.isInteger(n) && n >= 1 && n <= most)) return "Photosites must be an integer from 1 to " + shown(most) + ".";
+    const wrong = REQUIREMENTS.find(([id, , name]) => $(id).value.trim() && !(givenOf(id, name) > 0));
+    return wrong ? wrong[1] + " must be a positive number." : "";
   }
 
   async _create() {
@@ -150,14 +163,16 @@ export class StartPage {
     $("start-problem").textContent = problem;
     if (problem || !this.contents) return;
     const wanted = numberOf($("start-sites").value), before = JSON.stringify(this.newest()?.settings);
+    const given = REQUIREMENTS.filter(([id]) => $(id).value.trim()).map(([id, , name, factor]) => [name, factor * givenOf(id, name)]);
     const isDone = await this._choose({
-      do: "new_sensor", generator: $("start-generator").value, size_um: this._size().map((length) => length / MM_PER_UM),
-      n_sites: wanted, filters: $("start-filters").value || null, electronics: $("start-electronics").value,
+      do: "new_sensor", generator: $("start-generator").value, size_um: this._size()?.map((length) => length / MM_PER_UM) ?? null,
+      n_sites: Number.isFinite(wanted) ? wanted : null, ...Object.fromEntries(given), filters: $("start-filters").value || null, electronics: $("start-electronics").value,
     });
     const state = this.newest(), n = state?.summary.n_sites;
     if (!isDone) this.open({ problem: Object.values(state?.errors || {})[0] || "The server does not answer." });
     else if (n && JSON.stringify(state.settings) !== before) {
-      notice(shown(n) + " photosites" + (n === wanted ? "" : ", the nearest possible number to " + shown(wanted)));
+      notice(shown(n) + " photosites" + (Number.isFinite(wanted) && n !== wanted ? ", the nearest possible number to " + shown(wanted)
+        : ", the smallest of " + quantity(state.summary.min_size_um, "µm", 3)));
     }
   }
 

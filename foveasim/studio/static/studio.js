@@ -10,6 +10,7 @@ import { Editor } from "./authoring.js";
 import { Connection, memory } from "./connection.js";
 import { Controls, valueAt } from "./controls.js";
 import { Files } from "./files.js";
+import { Transport } from "./film_row.js";
 import { inNextFrame } from "./frames.js";
 import { GazePanel } from "./gaze_panel.js";
 import { ImagePane } from "./image_pane.js";
@@ -20,6 +21,7 @@ import { awaited, isPending } from "./pending.js";
 import { Problems } from "./problems.js";
 import { SitePane, useSoftware } from "./site_pane.js";
 import { Sources } from "./sources.js";
+import { showRows, startSplitters } from "./splitters.js";
 import { Views } from "./views.js";
 
 const BUSY_DELAY_MS = 150, LONG_MS = 1000;
@@ -130,6 +132,7 @@ function drawMarks() {
 function paint() { for (const pane of [panes.b, panes.a]) if (pane.scale && pane.map) pane.paint(page.range); }
 
 function resize() {
+  showRows();
   for (const name of MAPS) panes[name].resize();
   views.tell("draw");
   paint();
@@ -780,6 +783,7 @@ const studio = {
 Object.assign(window, { studio });
 
 function start() {
+  startSplitters();
   createPanes();
   controls = new Controls($("sections"), $("search"), $("only-changed"), $("hint"), {
     send: (key, value, isFinal) => connection.set(key, value, isFinal),
@@ -790,11 +794,12 @@ function start() {
   });
   createEditor();
   const scene = () => [...controls.rows.values()].find(({ control: { key, kind } }) => key === "scene" && kind === "choice");
-  sources = new Sources($("pane-scene"), {
+  const transport = new Transport();
+  sources = new Sources($("pane-scene"), transport, {
     connection: () => connection, state: () => page.state, choose: () => $("chosen-file").click(),
     charts: () => scene()?.control.choices || [], playing: () => gazePanel.film?.pause(),
   });
-  gazePanel = new GazePanel($("pane-scene"), panes.scene, {
+  gazePanel = new GazePanel($("pane-scene"), panes.scene, transport, {
     connection: () => connection, state: () => page.state, playing: () => sources.film?.pause(), redraw: () => ask("marks"),
   });
   views = new Views(studio, () => { followSignals(); sendViews(); resize(); });

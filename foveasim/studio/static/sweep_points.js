@@ -1,13 +1,12 @@
 // Points of a sweep: their settings and results as the server sends them, texts, and the Pareto front.
 
-import { quantity } from "/web/colours.js";
 import { axisTitle } from "./charts.js";
+import { quantity } from "./numbers.js";
 import { figure } from "./views/requirements.js";
 
 const NUMBERS = { ".inf": Infinity, "-.inf": -Infinity };
 // Infinite results are texts in JSON, and missing ones null.
 const numberOfResult = (value) => (typeof value === "number" ? value : NUMBERS[value] ?? NaN);
-const short = (value) => (Number.isInteger(value) ? value : Number(value.toPrecision(4)));
 
 // Indices of the points that no other point dominates, by their first result; isSmaller: whether smaller values are better.
 /** @type {(results: number[][], isSmaller: boolean[]) => number[]} */
@@ -67,7 +66,7 @@ export class SweepPoints {
 
   /** @param {number} k */
   settingsText(k) {
-    return this.settings(k).map((value, i) => this.axes[i].label + " " + quantity(short(value), this.axes[i].unit)).join(", ");
+    return this.settings(k).map((value, i) => this.axes[i].label + " " + quantity(value, this.axes[i].unit)).join(", ");
   }
 
   /** @param {number} k */

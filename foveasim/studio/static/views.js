@@ -2,7 +2,9 @@
 
 import { $, find, make, notice } from "/web/page_parts.js";
 import { load } from "./modules.js";
+import { showRows } from "./splitters.js";
 
+const GROUPS = ["See", "Measure", "Check", "Explore"];
 // From this width, more tiles are shown at first.
 const WIDE = 1800;
 
@@ -46,6 +48,13 @@ export class Views {
     try { chosen = JSON.parse(localStorage.getItem("foveasim-studio-tiles") || "null"); } catch { /* the first ones */ }
     /** @type {(view: ViewAbout) => boolean} */
     const isFirst = innerWidth >= WIDE ? (view) => view.is_wide : (view) => view.is_first;
+    const groups = new Map(GROUPS.map((name) => [name, make("div")]));
+    for (const [name, group] of groups) {
+      group.setAttribute("role", "group");
+      group.setAttribute("aria-label", name);
+      group.append(make("span", name, "quiet"));
+    }
+    $("tabs").replaceChildren(...groups.values());
     for (const view of list.filter((each) => each.is_tile)) {
       const tile = make("section", undefined, "tile"), button = make("button", view.label);
       tile.id = "tile-" + view.name;
@@ -57,7 +66,7 @@ export class Views {
       button.dataset.tile = view.name;
       button.addEventListener("click", () => this.show(view.name, !this.shown.has(view.name)));
       $("tiles").append(tile);
-      $("tabs").append(button);
+      groups.get(view.group)?.append(button);
       if (Array.isArray(chosen) ? chosen.includes(view.name) : isFirst(view)) this.shown.add(view.name);
       this._mark(view.name);
     }
@@ -82,6 +91,7 @@ export class Views {
     else this.shown.delete(name);
     try { localStorage.setItem("foveasim-studio-tiles", JSON.stringify([...this.shown])); } catch { /* not kept */ }
     this._mark(name);
+    showRows();
     if (this.made[name]) this._refresh(name);
     const loaded = this._load();
     this.changed();

@@ -180,23 +180,29 @@ const PREFIXED = new Set(["s", "F", "V", "bit/s"]);
 /** @type {[number, string][]} */
 const PREFIXES = [[1e9, "G"], [1e6, "M"], [1e3, "k"], [1, ""], [1e-3, "m"], [1e-6, "µ"], [1e-9, "n"], [1e-12, "p"], [1e-15, "f"]];
 
-// Formats a value with its unit, with a metric prefix where the unit has one, and otherwise with thousands.
-/** @param {number} value @param {string} unit */
-export function quantity(value, unit) {
-  if (!PREFIXED.has(unit) || !Number.isFinite(value) || !value) return shown(value) + (unit ? " " + unit : "");
-  const rounded = Number(value.toPrecision(4));
-  const [size, prefix] = PREFIXES.find(([from]) => Math.abs(rounded) >= from * (1 - 1e-9)) ?? PREFIXES[PREFIXES.length - 1];
-  return shown(Number((rounded / size).toPrecision(4))) + " " + prefix + unit;
+// Text with the sign of the charge of electrons, e⁻, and of degrees.
+/** @param {string} text */
+export const unitText = (text) => (text === "degrees" ? "°" : text.replace(/(?<![a-z0-9.])e-(?!\w)/gi, "e⁻"));
+
+// Formats a value with its unit, with a metric prefix where the unit has one, and otherwise with thousands; digits: significant
+// ones of numbers that are not integers.
+/** @param {number} value @param {string} [unit] @param {number} [digits] */
+export function quantity(value, unit = "", digits = 4) {
+  const size = Math.abs(value), isExact = !Number.isFinite(value) || Number.isInteger(value);
+  const rounded = isExact ? value : size >= 10 ** digits ? Math.round(value) : Number(value.toPrecision(digits));
+  if (!PREFIXED.has(unit) || !Number.isFinite(value) || !value) return shown(rounded) + (unit ? " " + unitText(unit.replace(/^1\//, "/")) : "");
+  const [from, prefix] = PREFIXES.find(([each]) => Math.abs(rounded) >= each * (1 - 1e-9)) ?? PREFIXES[PREFIXES.length - 1];
+  return shown(Number((rounded / from).toPrecision(digits))) + " " + prefix + unit;
 }
 
 // Formats a site's value of a column with its unit, using the site areas in µm²; "…" while the column is not loaded.
 /** @param {Column} column @param {number} site @param {Numbers} areas */
 export function textOf(column, site, areas) {
-  if (column.of) return shown(column.of === "size" ? Math.sqrt(areas[site]) : areas[site]) + " " + column.unit;
+  if (column.of) return shown(column.of === "size" ? Math.sqrt(areas[site]) : areas[site]) + " " + unitText(column.unit);
   if (!column.values) return "…";
   const value = column.values[site];
   if (column.names) return column.names[value];
-  return column.unit ? shown(value) + " " + column.unit : shown(value);
+  return column.unit ? shown(value) + " " + unitText(column.unit) : shown(value);
 }
 
 // Short number format for axes.

@@ -1,6 +1,6 @@
 // Legend of a colour scale: its colours with round values, or the categories with their counts; pictures with a legend.
 
-import { brief, clamp, shown } from "./colours.js";
+import { brief, clamp, shown, unitText } from "./colours.js";
 import { context2d } from "./gl.js";
 import { inkOf, make } from "./page_parts.js";
 
@@ -10,7 +10,7 @@ const MOST_KINDS = 40;
 const MARGIN = 14, TALL_ROW = 46, LOW_ROW = 22, RAMP = 220, SWATCH = 12;
 const FONT = "13px system-ui, sans-serif";
 
-export const titleOf = (column) => (column.unit ? column.label + " / " + column.unit : column.label);
+export const titleOf = (column) => (column.unit ? column.label + " / " + unitText(column.unit) : column.label);
 
 // Draws the colours of a scale, one row per filter on a mosaic.
 export function drawRamp(context, scale, width, height) {
@@ -64,7 +64,7 @@ export function swatchesOf(colours) {
 
 // Range and mean of the numbers of a scale, with their unit.
 export function summaryOf(scale) {
-  const { column, values } = scale, unit = column.unit ? " " + column.unit : "";
+  const { column, values } = scale, unit = column.unit ? " " + unitText(column.unit) : "";
   let sum = 0, count = 0;
   for (let i = 0; i < values.length; i++) if (Number.isFinite(values[i])) { sum += values[i]; count++; }
   return count === 0 ? "no values" :

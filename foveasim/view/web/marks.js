@@ -78,9 +78,10 @@ export function drawTrace(context, map, { path, box }) {
 // Draws the view of a map as a rectangle on a picture of this size, unless the map shows all of it.
 /** @type {(context: CanvasRenderingContext2D, picture: View, map: MapView, width: number, height: number) => void} */
 export function drawView(context, picture, map, width, height) {
-  const x0 = picture.toX(map.fromX(0)), y0 = picture.toY(map.fromY(0));
-  const x1 = picture.toX(map.fromX(map.width)), y1 = picture.toY(map.fromY(map.height));
-  if (x0 <= 1 && y0 <= 1 && x1 >= width - 1 && y1 >= height - 1) return;
+  const far = [picture.toX(map.fromX(0)), picture.toY(map.fromY(0)), picture.toX(map.fromX(map.width)), picture.toY(map.fromY(map.height))];
+  // Sides outside the picture are at its edge.
+  const [x0, y0, x1, y1] = far.map((at, i) => clamp(at, 2, (i % 2 ? height : width) - 2));
+  if (x0 <= 2 && y0 <= 2 && x1 >= width - 2 && y1 >= height - 2) return;
   const w = Math.max(5, x1 - x0), h = Math.max(5, y1 - y0);
   outline(context, () => context.rect(0.5 * (x0 + x1 - w), 0.5 * (y0 + y1 - h), w, h), [3.5, 1.75], [SHADE, WHITE]);
 }

@@ -1,21 +1,21 @@
 // Histogram and statistics of the values that the map shows.
 
-import { shown } from "/web/colours.js";
 import { statistics } from "/web/measure.js";
 import { make } from "/web/page_parts.js";
 import { addFiles } from "../chart_files.js";
 import { percent } from "../problems.js";
 import { Histogram } from "../charts.js";
+import { quantity } from "../numbers.js";
 
 // Returns statistics of the values of a pane by name, as texts.
 function statisticsOf({ column, sites }) {
-  if (column.names) return { n: shown(sites.n) };
-  const sorted = column.values.slice().sort(), figure = (v) => (Number.isNaN(v) ? "–" : shown(Number(v.toPrecision(4))));
+  if (column.names) return { n: quantity(sites.n) };
+  const sorted = column.values.slice().sort(), figure = (v) => (Number.isNaN(v) ? "–" : quantity(v, column.unit));
   // NaN is last.
   const found = statistics(sorted, sorted.keys()), first = sorted.findIndex((v) => v > -Infinity);
   const median = found.n ? sorted[first + (found.n >> 1)] : NaN;
   return {
-    n: shown(found.n), mean: figure(found.mean), median: figure(median), std: figure(found.std), min: figure(found.min),
+    n: quantity(found.n), mean: figure(found.mean), median: figure(median), std: figure(found.std), min: figure(found.min),
     max: figure(found.max),
   };
 }
@@ -34,15 +34,15 @@ export function create(root, { page, panes, setRange }) {
     draw,
     onSite: draw,
     onValues() {
-      const { a, b } = panes, { unit } = b.column || {};
+      const { a, b } = panes;
       if (!b.scale) return;
       const { n_sites: n, saturated_fraction: fraction } = page.state?.summary || {}, figures = statisticsOf(b);
       const isSignal = b.column.is_signal || ["code", "picture"].includes(b.column.key);
       if (isSignal && fraction) figures.saturated = percent(fraction);
-      if (isSignal && n && figures.n !== shown(n)) figures.n += " of " + shown(n);
+      if (isSignal && n && figures.n !== quantity(n)) figures.n += " of " + quantity(n);
       list.replaceChildren(...Object.entries(figures).map(([name, value]) => {
         const item = make("div");
-        item.append(make("dt", name), make("dd", value + (unit && !["n", "saturated"].includes(name) ? " " + unit : "")));
+        item.append(make("dt", name), make("dd", value));
         return item;
       }));
       // The page draws it with the mark of the photosite.

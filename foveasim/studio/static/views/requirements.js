@@ -1,14 +1,14 @@
 // Requirements of the settings: each with its result and its margin, and a form for new ones.
 
-import { quantity } from "/web/colours.js";
 import { make, notice } from "/web/page_parts.js";
 import { ConditionForm } from "../condition_form.js";
+import { quantity } from "../numbers.js";
 import { percent } from "../problems.js";
 
 // Results may be infinite, or have no value.
 export function figure(value, unit) {
   if (typeof value !== "number") return value === ".inf" ? "∞" : value === "-.inf" ? "−∞" : "–";
-  return quantity(Number.isInteger(value) ? value : Number(value.toPrecision(4)), unit === "fraction" ? "" : unit);
+  return quantity(value, unit === "fraction" ? "" : unit);
 }
 
 export function create(root, studio) {

@@ -1,31 +1,29 @@
 // Summary of the result, beside that of variant A, and warnings.
 
-import { quantity, shown } from "/web/colours.js";
 import { make } from "/web/page_parts.js";
+import { quantity } from "../numbers.js";
 import { percent } from "../problems.js";
 
 // Words of the summary that have another form than the key.
 const SUMMARY = {
-  n_sites: ["photosites", ""], width_um: ["width", "µm"], height_um: ["height", "µm"], min_size_um: ["smallest site", "µm"],
-  max_size_um: ["largest site", "µm"],
+  n_sites: ["photosites", ""], width_um: ["size", "µm"], min_size_um: ["smallest site", "µm"], max_size_um: ["largest site", "µm"],
   exposure_s: ["exposure", "s"], bits: ["bits", ""], mean_dn: ["mean code", "DN"], median_e: ["median signal", "e-"],
   saturated_fraction: ["saturated", "%"],
   dark_fraction: ["code 0", "%"], f_number: ["f-number", ""], magnification: ["magnification", ""],
 };
 
-function textOf(key, value) {
+function textOf(key, { [key]: value, height_um: height }) {
   if (value === undefined) return "–";
-  if (key.endsWith("_fraction")) return shown(Number((100 * value).toPrecision(3))) + " %";
-  const unit = SUMMARY[key]?.[1];
-  return quantity(Number.isInteger(value) ? value : Number(value.toPrecision(5)), unit ?? "");
+  if (key === "width_um") return quantity(value) + " × " + quantity(height, "µm");
+  return key.endsWith("_fraction") ? quantity(100 * value, "%", 3) : quantity(value, SUMMARY[key]?.[1]);
 }
 
 // Returns the rows of the numbers of a summary, beside those of variant A if there is one.
 function summaryRows(summary, before) {
   // Values of signals count saturated photosites with their clipped signal.
-  const text = (key, of) => textOf(key, of[key]) + (["mean_dn", "median_e"].includes(key) && of.saturated_fraction > 0
+  const text = (key, of) => textOf(key, of) + (["mean_dn", "median_e"].includes(key) && of.saturated_fraction > 0
     ? " (" + percent(of.saturated_fraction) + " saturated)" : "");
-  const rows = Object.entries(summary).filter(([, value]) => typeof value === "number").map(([key, value]) => {
+  const rows = Object.entries(summary).filter(([key, value]) => typeof value === "number" && key !== "height_um").map(([key, value]) => {
     const row = make("tr"), name = make("th", SUMMARY[key]?.[0] || key.replaceAll("_", " "));
     name.scope = "row";
     row.append(name, ...(before ? [make("td", text(key, before))] : []), make("td", text(key, summary)));
