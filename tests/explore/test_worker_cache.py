@@ -123,6 +123,7 @@ ABERRATIONS = (
 LEVELS = ("scene.luminance_cd_m2", "scene.illuminance_lux", "scene.reflectance")
 #: Other values of settings whose type does not suggest one.
 OTHERS = {
+    "times_s": [0.0, 0.05],
     "scene.picture": "other.png",
     "scene.spectrum": [[1.0, 0.5, 0.2], [0.5, 1.0, 0.5], [0.2, 0.5, 1.0]],
     "scene.wavelength_nm": [460.0, 560.0, 660.0],
