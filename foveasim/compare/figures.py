@@ -33,7 +33,7 @@ BAND = "95 % interval"
 
 
 def draw_measure(comparison: Comparison, name: str, axes: Axes) -> None:
-    """Draw one metric of all cameras against eccentricity, with 95 % intervals of the median over the scenes."""
+    """Draw a metric of all cameras against eccentricity, with its 95 % intervals."""
     info = metric_info(name)
     intervals = comparison.summary(name, by_eccentricity=True)
     r_um = 0.5 * (comparison.edges_um[1:] + comparison.edges_um[:-1])

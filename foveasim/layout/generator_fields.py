@@ -40,7 +40,7 @@ def with_field(
 
 
 def with_scale(parameters: Mapping[str, Any], factor: float, limit_um: float) -> dict[str, Any]:
-    """Return parameters of a generator with its lengths times a factor, and a largest radius of at most ``limit_um``."""
+    """Return parameters with lengths times a factor, and radii of at most ``limit_um``."""
     found = {name: _scaled(value, factor) if name.endswith(LENGTH) else value for name, value in parameters.items()}
     return found | {LIMIT: min(found[LIMIT], rounded_down(limit_um, DIGITS))} if LIMIT in found else found
 

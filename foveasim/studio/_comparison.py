@@ -92,7 +92,7 @@ def compare(variants: Sequence[tuple[str, Simulated]]) -> dict[str, Any]:
 
 
 def _best(values: Sequence[float | None], better: str | None) -> list[int]:
-    """Return the indices of the best values; none where all are about equal, or none is better."""
+    """Return the indices of the best values; none if all are about equal."""
     known = [value for value in values if value is not None and not np.isnan(value)]
     if better is None or not known or math.isclose(min(known), max(known), rel_tol=SAME_VALUE):
         return []

@@ -77,7 +77,7 @@ def thumbnail_name(name: str) -> str:
 
 def apply_preset(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return the settings of a preset; a layout replaces that of the given settings, at the centre of the image.
+    Return the settings of a preset; a layout replaces that of the given settings.
 
     Raises ParameterError when the preset does not exist.
     """

@@ -564,7 +564,7 @@ class Session:
         self.send({"kind": "text", "id": number, "what": what, "text": text, "files": files})
 
     def line(self, error: BaseException) -> str:
-        """Return an error in one line in the words of the controls, without the directory of uploads."""
+        """Return an error in one line, in the words of the controls, without directories."""
         if isinstance(error, CancelledError):
             return str(error)
         return worded(one_line(error).replace(f"{self.uploads}/", ""))

@@ -455,7 +455,7 @@ def test_unknown_format_raises_without_output(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_noise_budget_has_dots_per_source_and_class():
+def test_noise_budget_has_dots_per_source():
     layout = fs.layout.grid(n_x=4, n_y=1, pitch_um=2.0)
     sensor = fs.Sensor(layout, read_noise_e=[3.0, 3.0, 5.0, 5.0], prnu_fraction=0.01)
     noise_e = fs.sensor.noise_budget(sensor, np.full(4, 400.0), 1.0)

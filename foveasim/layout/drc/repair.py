@@ -217,7 +217,7 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "best") -> t
 @layout_edit(example={"rules": DesignRules(min_size_um=5.0)})
 def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair = "best") -> Layout:
     """
-    Return a layout repaired to satisfy the rules, with a record of the repair in its provenance.
+    Return a layout that satisfies rules, with a record of the repair in its provenance.
 
     Parameters
     ----------

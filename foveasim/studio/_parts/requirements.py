@@ -18,7 +18,7 @@ OF_SIGNALS = ("mean_code_dn", "psnr_db", "ssim", "snr", "snr_db", "snr_mean_db")
 
 
 def saturated_fraction(requirement: Requirement, result: Simulated) -> float:
-    """Return the fraction of saturated photosites among those of a requirement on signals; 0 for others."""
+    """Return the saturated fraction of the photosites of a requirement on signals, or 0."""
     if requirement.measure not in OF_SIGNALS:
         return 0.0
     return result_of(replace(requirement, measure="saturated_fraction"), result.shot, result.capture)

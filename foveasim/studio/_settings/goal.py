@@ -26,7 +26,7 @@ SAME_VALUE = 1e-5
 
 @handles(SeekValue)
 def _seek(session: Session, message: SeekValue) -> dict[str, Any] | None:
-    """Return settings in which a requirement is met, None for the present ones, and send the curve of its results."""
+    """Return settings that meet a requirement, or None if these do; send its curve."""
     settings, key = session.history.settings, message.key
     control = number_control(session.controls, key)
     start = session.required_result("start from")

@@ -19,7 +19,7 @@ REPAIR = "repair"
 
 def with_repair(settings: Mapping[str, Any], method: str) -> dict[str, Any]:
     """
-    Return settings whose last edit is a repair by a method, instead of a repair that is the last one.
+    Return settings whose last edit is a repair by a method, instead of an earlier one.
 
     Raises ParameterError when the layout has no design rules.
     """
@@ -38,7 +38,7 @@ def _repair(session: Session, message: RepairLayout) -> dict[str, Any]:
 
 @handles(PreviewRepairs)
 def _preview(session: Session, message: PreviewRepairs) -> None:
-    """Send the changes of each method, until another message waits; the engine keeps the layouts."""
+    """Send the changes of each method until another message waits; keep the layouts."""
     session.send({"kind": "busy"})
     settings = session.frames.with_current(session.history.settings)
     for method in get_args(Repair):

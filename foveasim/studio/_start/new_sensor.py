@@ -99,7 +99,7 @@ def new_sensor(session: Session, message: NewSensor) -> dict[str, Any]:
 
 
 def _min_size_um(session: Session, message: NewSensor) -> float | None:
-    """Return the required size of the smallest site, also from the angular resolution on the axis of the lens."""
+    """Return the required size of the smallest site, also from sites per degree."""
     if message.sites_per_deg is None:
         return message.min_size_um
     shot = session.required_result("new_sensor").shot
@@ -140,7 +140,7 @@ def _layout(
     is_most: bool = False,
 ) -> dict[str, Any]:
     """
-    Return the section of a layout that follows from what is given, with the design rules that it satisfies.
+    Return the section of a layout for what is given, with rules that it satisfies.
 
     ``is_most``: whether fewer photosites are possible, too.
     """
@@ -252,7 +252,7 @@ def _solved(generator: str, parameters: Mapping[str, Any], n_sites: int, *, is_r
 
 
 def _with_sectors(parameters: Mapping[str, Any], n_sites: int) -> dict[str, Any]:
-    """Return parameters of log-polar rings with the number of sectors for about a number of photosites."""
+    """Return parameters of log-polar rings with about a number of photosites."""
     found, n_sectors = dict(parameters), parameters["n_sectors"]
     for _ in range(MAX_TRIES):
         try:

@@ -201,7 +201,7 @@ def plot_noise_budget(
     noise_e: Mapping[str, Floats], *, classes: ArrayLike | None = None, ax: Axes | None = None
 ) -> Axes:
     """
-    Draw the noise budget: one dot for the RMS of every source on a logarithmic scale, temporal sources on top.
+    Draw the noise budget as a dot for the RMS of every source, temporal ones on top.
 
     Parameters
     ----------
