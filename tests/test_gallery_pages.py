@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import sys
 from pathlib import Path
@@ -16,11 +17,11 @@ SCRIPTS = sorted((REPOSITORY / "gallery").glob("*.py"))
 
 @pytest.fixture
 def pages(monkeypatch):
-    monkeypatch.syspath_prepend(str(REPOSITORY / "docs"))
-    import gallery_pages
-
-    yield gallery_pages
-    sys.modules.pop("gallery_pages", None)
+    spec = importlib.util.spec_from_file_location("gallery_pages", REPOSITORY / "docs" / "gallery_pages.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)  # dataclasses look their modules up
+    spec.loader.exec_module(module)
+    return module
 
 
 def code_lines(text):

@@ -13,8 +13,8 @@ import numpy as np
 
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.layout import LAYOUTS, Layout
-from foveasim.layout.generator_fields import RECTANGULAR, with_field
 from foveasim.studio._messages.models import MatchBudget, SolveFor, handles
+from foveasim.studio._settings.generator_fields import RECTANGULAR, with_field
 
 if TYPE_CHECKING:
     from foveasim.studio._session import Session

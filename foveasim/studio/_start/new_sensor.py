@@ -14,13 +14,13 @@ from foveasim._core.validation import check_choice, check_length_um
 from foveasim.config import build_shot
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import LAYOUTS, MOSAICS, Layout
-from foveasim.layout.generator_fields import RECTANGULAR, rounded_down, with_field, with_scale
 from foveasim.scene import Scene
 from foveasim.sensor import PRESETS
 from foveasim.studio._engine import MAX_SITES
 from foveasim.studio._files import with_covering_scene, with_layout, without_gaze
 from foveasim.studio._messages.models import NewSensor, handles
 from foveasim.studio._settings.changes import choose_preset, match_filters
+from foveasim.studio._settings.generator_fields import RECTANGULAR, rounded_down, with_field, with_scale
 from foveasim.studio._settings.templates import templates
 from foveasim.studio._settings.unknowns import INSTEAD_OF, generated_layout, with_n_sites
 
