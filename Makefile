@@ -71,12 +71,12 @@ test-torch: $(TORCH_VENV)/.installed
 	FOVEASIM_TESTS=$(EFFORT) FOVEASIM_TESTS_NEED=torch,deepinv,torchvision $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) tests/test_docs.py \
 		tests/test_doctests.py tests/test_gallery.py tests/test_notebooks.py tests/installation -k "torch or learn or adapters" $(PYTEST_ARGS)
 
-# Files of other programs, which these write and read.
+# Files of other programs, which these write and read; their dependencies may have deprecation warnings among each other.
 test-interop: $(INTEROP_VENV)/.installed
-	FOVEASIM_TESTS=all FOVEASIM_TESTS_NEED=interop $(INTEROP_VENV)/bin/python -m pytest $(PARALLEL) tests/interop \
+	FOVEASIM_TESTS=all FOVEASIM_TESTS_NEED=interop $(INTEROP_VENV)/bin/python -m pytest $(PARALLEL) -W default::DeprecationWarning tests/interop \
 		tests/distortion/test_calibration_files.py tests/_io/test_picture_colours.py tests/video/test_frame_times.py \
 		tests/video/test_video_colours.py $(PYTEST_ARGS)
-	FOVEASIM_TESTS=all $(INTEROP_VENV)/bin/python -m pytest $(PARALLEL) tests/layout/files/test_chip_records.py tests/maps/test_maps.py \
+	FOVEASIM_TESTS=all $(INTEROP_VENV)/bin/python -m pytest $(PARALLEL) -W default::DeprecationWarning tests/layout/files/test_chip_records.py tests/maps/test_maps.py \
 		-k "klayout or gdstk or astropy" $(PYTEST_ARGS)
 
 # Kills workers at random for some minutes: every item must be computed, or have lost its worker three times.

@@ -10,6 +10,7 @@ from foveasim.layout.generator_registry import summary_of
 from foveasim.sensor import PRESETS
 from foveasim.studio._engine import MAX_SITES
 from foveasim.studio._files import Files, preset_paths, presets, thumbnail_name
+from foveasim.studio._settings.generator_fields import RECTANGULAR
 from foveasim.studio._settings.templates import has_mosaic
 from foveasim.studio._start import new_sensor as sensors
 from foveasim.studio._start.recent import recent_files
@@ -71,7 +72,7 @@ def _generator(name: str) -> dict[str, Any]:
         "name": name,
         "label": name.replace("_", " "),
         "text": f"{text[:1].upper()}{text[1:]}.",
-        "fills_format": name in sensors.RECTANGULAR,
+        "fills_format": name in RECTANGULAR,
         "has_mosaic": has_mosaic(name),
     }
 

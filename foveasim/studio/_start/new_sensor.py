@@ -173,7 +173,8 @@ def _layout(
         raise contradiction(n_wanted, *other, (n_possible, math.sqrt(area_um2 / n_possible)))
     if generator == "log_polar":
         given = templates("log_polar parameters") | {"min_size_um": min_size_um, "r_max_um": 0.5 * min(size_um)}
-        section = {"generator": generator, "parameters": _with_sectors(given, n_sites) if n_sites else given}
+        parameters = _with_sectors(given, n_sites) if n_sites else given
+        section: dict[str, Any] = {"generator": generator, "parameters": parameters}
         n_built = _built(section, settings).n_sites
         if n_sites and abs(n_built / n_sites - 1.0) > TOLERANCE:
             raise contradiction(n_sites, (n_built, min_size_um))
