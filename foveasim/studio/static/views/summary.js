@@ -12,7 +12,8 @@ const SUMMARY = {
   dark_fraction: ["code 0", "%"], f_number: ["f-number", ""], magnification: ["magnification", ""],
 };
 
-function textOf(key, { [key]: value, height_um: height }) {
+function textOf(key, summary) {
+  const value = summary[key], height = summary.height_um;
   if (value === undefined) return "–";
   if (key === "width_um") return quantity(value) + " × " + quantity(height, "µm");
   return key.endsWith("_fraction") ? quantity(100 * value, "%", 3) : quantity(value, SUMMARY[key]?.[1]);
