@@ -630,7 +630,8 @@ export class Editor {
       rules: layout.rules
         ? { exist: true, text: n ? shown(n) + (n === 1 ? " violation" : " violations") : "rules satisfied",
           title: "Show the design rules", isWrong: n > 0 && Boolean(violations) }
-        : { exist: false, text: "Add design rules", title: "Check the minimum site size, the width and overlaps while drawing", isWrong: false },
+        : { exist: false, text: "Add design rules", title: "Check the minimum site size, the width and overlaps while drawing",
+          isWrong: false },
     });
   }
 }

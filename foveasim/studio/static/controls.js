@@ -187,7 +187,8 @@ class Row {
   /** @param {string} text @param {string[]} words */
   rank(text, words) {
     if (!words.every((word) => this.words.includes(word))) return 0;
-    const [label, ...others] = this.phrases, starts = (/** @type {string} */ name) => words.every((word) => (" " + name).includes(" " + word));
+    const [label, ...others] = this.phrases;
+    const starts = (/** @type {string} */ name) => words.every((word) => (" " + name).includes(" " + word));
     const rank = label === text ? 5 : others.includes(text) ? 4 : starts(label) ? 3 : starts(this.phrases.join(" ")) ? 2 : 1;
     return rank + (this.isExtra ? 0 : 0.5) + 0.4 / label.length;
   }

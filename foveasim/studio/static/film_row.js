@@ -71,7 +71,8 @@ export class Transport {
     slider.max = String(last);
     if (!film || film.isPlaying || !film.isBusy) slider.value = String(n);
     const playing = film?.isPlaying ? names.pause : names.play;
-    for (const [element, name] of /** @type {[HTMLElement, string][]} */ ([[back, names.back], [play, playing], [forward, names.forward]])) {
+    for (const [element, name] of /** @type {[HTMLElement, string][]} */ ([[back, names.back], [play, playing],
+      [forward, names.forward]])) {
       change(element, { title: name, ariaLabel: name });
     }
     change(slider, { ariaLabel: names.slider, ariaValueText: words, disabled: last < 1 });

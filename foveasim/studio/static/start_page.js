@@ -115,7 +115,8 @@ export class StartPage {
       $(id).replaceChildren(...presets.filter(({ kind }) => kind === wanted).map(cardOf));
     }
     fill("start-generator", generators, initial.generator);
-    fill("start-format", [...formats, { name: OWN_SIZE, label: "own size" }, { name: ANY_SIZE, label: "follows from the requirements" }], initial.format);
+    const others = [{ name: OWN_SIZE, label: "own size" }, { name: ANY_SIZE, label: "follows from the requirements" }];
+    fill("start-format", [...formats, ...others], initial.format);
     fill("start-filters", [{ name: "", label: "none" }, ...mosaics], initial.filters);
     fill("start-electronics", electronics, initial.electronics);
     $("start-sites").placeholder = shown(initial.n_sites);
@@ -152,7 +153,8 @@ export class StartPage {
 
   _problem() {
     const text = $("start-sites").value.trim(), n = numberOf(text), most = this.contents?.max_sites ?? Infinity;
-    if (!this._size()?.every((length) => length > 0) && $("start-format").value !== ANY_SIZE) return "Width and height must be positive numbers.";
+    const isGiven = $("start-format").value !== ANY_SIZE;
+    if (isGiven && !this._size()?.every((length) => length > 0)) return "Width and height must be positive numbers.";
     if (text && !(Number.isInteger(n) && n >= 1 && n <= most)) return "Photosites must be an integer from 1 to " + shown(most) + ".";
     const wrong = REQUIREMENTS.find(([id, , name]) => $(id).value.trim() && !(givenOf(id, name) > 0));
     return wrong ? wrong[1] + " must be a positive number." : "";
@@ -166,7 +168,8 @@ export class StartPage {
     const given = REQUIREMENTS.filter(([id]) => $(id).value.trim()).map(([id, , name, factor]) => [name, factor * givenOf(id, name)]);
     const isDone = await this._choose({
       do: "new_sensor", generator: $("start-generator").value, size_um: this._size()?.map((length) => length / MM_PER_UM) ?? null,
-      n_sites: Number.isFinite(wanted) ? wanted : null, ...Object.fromEntries(given), filters: $("start-filters").value || null, electronics: $("start-electronics").value,
+      n_sites: Number.isFinite(wanted) ? wanted : null, ...Object.fromEntries(given),
+      filters: $("start-filters").value || null, electronics: $("start-electronics").value,
     });
     const state = this.newest(), n = state?.summary.n_sites;
     if (!isDone) this.open({ problem: Object.values(state?.errors || {})[0] || "The server does not answer." });

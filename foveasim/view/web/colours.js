@@ -190,7 +190,8 @@ export const unitText = (text) => (text === "degrees" ? "°" : text.replace(/(?<
 export function quantity(value, unit = "", digits = 4) {
   const size = Math.abs(value), isExact = !Number.isFinite(value) || Number.isInteger(value);
   const rounded = isExact ? value : size >= 10 ** digits ? Math.round(value) : Number(value.toPrecision(digits));
-  if (!PREFIXED.has(unit) || !Number.isFinite(value) || !value) return shown(rounded) + (unit ? " " + unitText(unit.replace(/^1\//, "/")) : "");
+  const isPlain = !PREFIXED.has(unit) || !Number.isFinite(value) || !value;
+  if (isPlain) return shown(rounded) + (unit ? " " + unitText(unit.replace(/^1\//, "/")) : "");
   const [from, prefix] = PREFIXES.find(([each]) => Math.abs(rounded) >= each * (1 - 1e-9)) ?? PREFIXES[PREFIXES.length - 1];
   return shown(Number((rounded / from).toPrecision(digits))) + " " + prefix + unit;
 }
