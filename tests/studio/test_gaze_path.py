@@ -90,10 +90,10 @@ def test_waiting_replays_are_simulated_once(recorder):
 @pytest.mark.parametrize(
     ("message", "problem"),
     [
-        ({"do": "follow", "t_s": "soon", "final": False}, "'t_s'"),
-        ({"do": "follow", "final": True}, "'t_s'"),
-        ({"do": "saccades", "seed": -1, "duration_s": 1.0}, "'seed'"),
-        ({"do": "saccades", "seed": 1, "duration_s": "long"}, "'duration_s'"),
+        ({"do": "follow", "t_s": "soon", "final": False}, "(t_s)"),
+        ({"do": "follow", "final": True}, "(t_s)"),
+        ({"do": "saccades", "seed": -1, "duration_s": 1.0}, "(seed)"),
+        ({"do": "saccades", "seed": 1, "duration_s": "long"}, "(duration_s)"),
         ({"do": "saccades", "seed": 1, "duration_s": 1e6}, "(duration_s) must be at most"),
         ({"do": "gaze_file", "path": "/etc/passwd"}, "is not available here"),
         ({"do": "set", "key": "gaze_path", "value": [[0, 0, 0], [0, 1, 1]]}, "0 s in row 2 after 0 s in row 1"),
