@@ -927,7 +927,7 @@ def test_exr_attributes_that_change_values_are_reported(tmp_path, attributes, ma
     channels = {f"S0.{wave_nm:g}nm": band.astype(np.float32) for wave_nm, band in zip(WAVES, VALUES, strict=True)}
     header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage, "expTime": 0.1, "owner": "someone"}
     for more, is_good in (({}, True), (attributes, False)):
-        with OpenEXR.File({**header, **more}, channels) as file:
+        with OpenEXR.File({**header, **more}, dict(channels)) as file:
             file.write(str(tmp_path / "cube.exr"))
         if is_good:
             np.testing.assert_array_equal(radiance(Scene.from_cube(tmp_path / "cube.exr", **RADIANCE)), VALUES)
