@@ -150,7 +150,7 @@ def test_rules_list_violations(engine, settings):
     assert good["is_satisfied"]
     assert [rule["count"] for rule in good["rules"]] == [0]
     assert [rule["count"] for rule in bad["rules"]] == [224]
-    assert none == {"rules": []}
+    assert none == {"rules": [], "repairs": []}
 
 
 def test_summary_contains_numbers_of_capture(engine, settings):

@@ -135,12 +135,13 @@ def test_splitters_are_dragged_and_kept(visit):
     before = {name: box(page, name) for name in ("#controls", "#pane-sites", "#tiles")}
     for name, dx, dy in (("#controls", 60, 0), ("#pane-sites", -90, 0), ("#dock", 0, -70)):
         at = box(page, f"{name} > .splitter")
-        x, y = at["x"] + 0.5 * at["width"], at["y"] + 0.5 * at["height"]
+        # Away from the middle, where another splitter ends.
+        x, y = at["x"] + 0.4 * at["width"], at["y"] + 0.3 * at["height"]
         page.mouse.move(x, y)
         page.mouse.down()
         page.mouse.move(x + dx, y + dy, steps=3)
         page.mouse.up()
-    settle(page)
+        settle(page)
     after = {name: box(page, name) for name in before}
 
     assert after["#controls"]["width"] == pytest.approx(before["#controls"]["width"] + 60, abs=2)
@@ -209,13 +210,12 @@ def test_unset_settings_look_unset(visit):
     assert field.get_attribute("placeholder") == "not set"
     assert control(page, "scene.field_of_view_deg", "input[type=range]").get_attribute("aria-valuetext") == "not set"
     assert control(page, "sensor.dead_fraction").get_attribute("placeholder") == "0"
-    field.fill("40")
-    field.press("Enter")
+    exposure = control(page, "exposure_s")
+    exposure.fill("-1")
+    exposure.press("Enter")
     until(page, "() => studio.isIdle && Object.keys(studio.state.errors).length > 0")
     # The words of the control stand before the name in settings.
-    assert "Field of view (scene.field_of_view_deg)" in page.inner_text(
-        "#problem, .control[data-key='scene.field_of_view_deg'] .error"
-    )
+    assert "Exposure (exposure_s)" in page.inner_text(".control[data-key='exposure_s'] .error")
 
 
 def test_numbers_have_one_form(visit):
@@ -247,14 +247,24 @@ def test_video_and_gaze_path_share_transport(visit, tmp_path):
 
 
 def test_outline_of_view_stays_in_pane(visit):
-    """The rectangle of the map's view is closed in the pane of the optical image, also where it ends above the image."""
+    """The rectangle of the map's view is closed in the pane of the optical image, also where it ends outside the image."""
     page = visit(width=1366, height=768)
-    page.evaluate("() => { studio.panes.b.map.y += 400; studio.ask('map'); }")
+    at = box(page, "#map")
+    x, y = at["x"] + 0.5 * at["width"], at["y"] + 0.5 * at["height"]
+    page.mouse.move(x, y)
+    page.mouse.wheel(0, -300)
     settle(page)
+    for _ in range(5):
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x, y + 0.45 * at["height"], steps=3)
+        page.mouse.up()
+        settle(page)
     is_drawn = page.evaluate(
         """() => { const { marks } = studio.panes.scene, ratio = marks.width / marks.clientWidth;
-        const { data } = marks.getContext("2d").getImageData(0, 0, marks.width, Math.ceil(4 * ratio));
-        return data.some((value, i) => i % 4 === 3 && value > 0); }"""
+        const high = Math.ceil(4 * ratio), context = marks.getContext("2d");
+        const edges = [0, marks.height - high].map((y) => context.getImageData(0, y, marks.width, high).data);
+        return edges.some((data) => data.some((value, i) => i % 4 === 3 && value > 0)); }"""
     )
 
     assert is_drawn

@@ -56,13 +56,13 @@ def test_hexagons_against_squares(tmp_path, visit):
         for name in ("squares", "hexagons", "fine hexagons"):
             page.check(f"input[aria-label='Compare {name}']")
             until(page, f"() => studio.state.variants.find(({{ name }}) => name === '{name}').is_compared")
-        until(page, "() => document.querySelectorAll('#comparison th[scope=col]').length === 4")
+        until(page, "() => document.querySelectorAll('#comparison th[scope=col]').length === 5")
         found = cells(page)
 
         heads = page.locator("#comparison th[scope=col]").all_inner_texts()
-        assert heads == ["fine hexagons", "hexagons", "squares", "B"]
-        assert found["n_sites"] == ["4,080", "1,020", "900", "4,080"]
-        fine, coarse, squares, _ = map(decibels, found["field_psnr_db"])
+        assert heads == ["fine hexagons", "hexagons", "squares", "B", "B − fine hexagons"]
+        assert found["n_sites"] == ["4,080", "1,020", "900", "4,080", "0"]
+        fine, coarse, squares, *_ = map(decibels, found["field_psnr_db"])
         assert fine > coarse > squares - 1.0
 
         # After a restart, the page has the variants and compares them again.
@@ -70,7 +70,7 @@ def test_hexagons_against_squares(tmp_path, visit):
         own.start()
         until(page, "() => studio.isIdle && studio.state.variants.filter((each) => each.is_compared).length === 3")
         assert page.input_value("#variants li:first-child input[aria-label^='Note']") == "a quarter of the photosites"
-        until(page, "() => document.querySelectorAll('#comparison th[scope=col]').length === 4")
+        until(page, "() => document.querySelectorAll('#comparison th[scope=col]').length === 5")
         change(page, "() => document.querySelector(\"button[aria-label='Apply squares']\").click()")
         assert setting(page, "layout")["generator"] == "grid"
         assert cells(page)["n_sites"][-1] == "900"
