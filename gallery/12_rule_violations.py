@@ -79,12 +79,12 @@ def main(out_dir: Path) -> None:
     print(report)
     axes = report.plot(layout, figure_inches=8.0)
     for site, text in INSERTED.items():
-        arrow = {"arrowstyle": "->", "color": "black"}
+        arrow = {"arrowstyle": "->", "color": "#22224a"}
         box = {"boxstyle": "round", "facecolor": "white", "edgecolor": "0.6"}
         x_um, y_um = layout.centroid_um[site]
         at_um = (
             x_um + (3.2 if x_um < 0.0 else -3.2),
-            y_um + (2.9 if y_um < 0.0 else -2.9),
+            y_um + (-2.9 if text == "narrow space" else 2.9),
         )
         axes.annotate(
             text,
