@@ -157,7 +157,7 @@ def _layout_lines(writer: _Writer, section: Any, variable: str = "layout") -> li
         first = {} if call.startswith(f"{variable}.") else {"layout": layout}
         return f"{layout} = {writer.call(call, {**first, **values}, positional=('layout',))}"
 
-    rules = section.rules
+    rules = getattr(section, "rules", None)  # layouts within edits have none
     if rules is not None and variable == "layout":
         lines.append(writer.assignment("rules", rules))
         rules = _Name("rules")
