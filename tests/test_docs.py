@@ -299,11 +299,13 @@ def test_results_are_lines_and_last_value(session):
 
 
 def test_written_pictures_are_results(session):
-    code = "from PIL import Image\nImage.open('photo.jpg').resize((8, 4)).save('small.png')"
+    code = "from PIL import Image\nwith Image.open('photo.jpg') as photo:\n    photo.resize((8, 4)).save('small.png')"
     printed, pictures = session.run(code, "python")
 
     assert printed == ""
-    assert [Image.open(picture).size for picture in pictures] == [(8, 4)]
+    (picture,) = pictures
+    with Image.open(picture) as small:
+        assert small.size == (8, 4)
     assert session.run("1 + 1", "python") == ("2", [])
 
 
