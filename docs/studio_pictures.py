@@ -167,7 +167,9 @@ def main() -> None:
                 word.rstrip(";,") for word in line.split() if word.startswith("http")
             )
             browser = playwright.chromium.launch(
-                executable_path=shutil.which("chromium"), args=list(SOFTWARE)
+                executable_path=shutil.which("chromium-headless-shell")
+                or shutil.which("chromium"),
+                args=list(SOFTWARE),
             )
             temporary = Path(directory)
             tasks = {

@@ -149,10 +149,8 @@ def main(out_dir: Path) -> None:
     save_figure(figure, out_dir / "04_foveas.png", dpi=140)
 
     # %% Checks.
-    assert {
-        name.lower().replace("-", "_").replace(" ", "_").removesuffix("_points")
-        for name in layouts
-    } >= set(fs.layout.LAYOUTS)
+    shown = {layout.provenance["generator"] for layout in layouts.values()}
+    assert shown == set(fs.layout.LAYOUTS)
     no_overlap = fs.DesignRules(max_overlap_um2=0.0)
     for name, layout in (layouts | foveas).items():
         assert layout.check(no_overlap).ok, name

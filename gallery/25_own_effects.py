@@ -135,7 +135,7 @@ def main(out_dir: Path) -> None:
         axes.set_axis_off()
     save_figure(figure, out_dir / "25_own_effects.png", dpi=140)
 
-    # %% Noise budget, with a bar for each effect.
+    # %% Noise budget, with a dot for each effect.
     budget = fs.sensor.noise_budget(sensor, rate_e_per_s, EXPOSURE_S)
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
     plot_noise_budget(budget, ax=figure.add_subplot())

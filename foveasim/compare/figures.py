@@ -96,7 +96,9 @@ def overview(comparison: Comparison) -> NDArray[Any]:
         entries = {
             label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)
         }
-        figure.legend(entries.values(), list(entries), loc="outside upper center", ncols=len(entries), frameon=False)
+        figure.legend(
+            list(entries.values()), list(entries), loc="outside upper center", ncols=len(entries), frameon=False
+        )
     return axes[: len(draws)]
 
 

@@ -107,6 +107,8 @@ class MetricInfo:
         Whether the metric is one number, or has a headline.
     jumps_to_zero : bool
         Whether 0 means that there is no result, as the signal-to-noise ratio of saturated sites.
+    is_of_signals : bool
+        Whether saturated photosites contribute clipped signals, or none, so that their fraction belongs beside the result.
     reference : function of a shot and its camera, optional
         Computes the argument ``reference`` of the metric. It may depend only on the photoelectron rates of an ideal raster,
         the exposure time and the bit depth, because captures share the result.
@@ -128,6 +130,7 @@ class MetricInfo:
     headline: str = ""
     is_number: bool = True
     jumps_to_zero: bool = False
+    is_of_signals: bool = False
     reference: Callable[..., Any] | None = None
 
     __repr__ = short_repr

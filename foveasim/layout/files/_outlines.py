@@ -21,7 +21,7 @@ from foveasim.layout.packed import check_sizes
 
 #: Units of length that users may state, and their sizes in µm.
 LengthUnit: TypeAlias = Literal["nm", "um", "mm", "cm", "m", "mil", "in"]
-LENGTHS_UM: dict[str, float] = {unit: length_in_um(unit) or 0.0 for unit in get_args(LengthUnit)}
+LENGTHS_UM = {unit: size_um for unit in get_args(LengthUnit) if (size_um := length_in_um(unit)) is not None}
 Invalid: TypeAlias = Literal["error", "skip", "repair"]
 Parts: TypeAlias = Literal["error", "split", "largest"]
 

@@ -12,7 +12,7 @@ from foveasim.metrics.registry import METRICS, MetricInfo, MetricShot
 __all__ = ["mean_code_dn", "saturated_fraction"]
 
 
-@METRICS.register("mean_code_dn", info=MetricInfo(title="mean code", unit="DN"))
+@METRICS.register("mean_code_dn", info=MetricInfo(title="mean code", unit="DN", is_of_signals=True))
 def mean_code_dn(shot: MetricShot, camera: Camera, capture: Capture, sites: Ints | None = None) -> float:  # noqa: ARG001
     """Return the mean code, DN."""
     return float(np.mean(capture.code if sites is None else capture.code[sites]))

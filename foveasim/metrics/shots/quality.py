@@ -33,6 +33,7 @@ def ideal_picture(shot: MetricShot, camera: Camera, region: Region | None = None
         title="PSNR",
         unit="dB",
         definition="peak signal-to-noise ratio of the picture, with the range of the ideal picture as peak",
+        is_of_signals=True,
         reference=ideal_picture,
     ),
 )
@@ -54,6 +55,7 @@ def picture_psnr_db(
         better="high",
         title="SSIM",
         definition="structural similarity of the picture and the ideal picture",
+        is_of_signals=True,
         reference=ideal_picture,
     ),
 )

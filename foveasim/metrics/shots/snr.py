@@ -21,7 +21,10 @@ def signal_to_noise_of(shot: MetricShot, camera: Camera, capture: Capture) -> Fl
 
 
 @METRICS.register(
-    "snr", info=MetricInfo(better="high", title="signal-to-noise ratio", headline="median", jumps_to_zero=True)
+    "snr",
+    info=MetricInfo(
+        better="high", title="signal-to-noise ratio", headline="median", jumps_to_zero=True, is_of_signals=True
+    ),
 )
 def snr(shot: MetricShot, camera: Camera, capture: Capture, sites: Ints | None = None) -> dict[str, float]:
     """
@@ -34,7 +37,9 @@ def snr(shot: MetricShot, camera: Camera, capture: Capture, sites: Ints | None =
     return {"mean": float(ratio.mean()), "median": float(np.median(ratio))}
 
 
-@METRICS.register("snr_db", info=MetricInfo(better="high", title="signal-to-noise ratio", unit="dB"))
+@METRICS.register(
+    "snr_db", info=MetricInfo(better="high", title="signal-to-noise ratio", unit="dB", is_of_signals=True)
+)
 def snr_db(shot: MetricShot, camera: Camera, capture: Capture, sites: Ints | None = None) -> float:
     """Return the median signal-to-noise ratio, dB."""
     return _db(snr(shot, camera, capture, sites)["median"])
@@ -47,6 +52,7 @@ def snr_db(shot: MetricShot, camera: Camera, capture: Capture, sites: Ints | Non
         title="SNR per site",
         unit="dB",
         definition="signal-to-noise ratio of a site, 0 if it is saturated, mean over the sites, 20 log₁₀",
+        is_of_signals=True,
     ),
 )
 def snr_mean_db(shot: MetricShot, camera: Camera, capture: Capture, sites: Ints | None = None) -> float:

@@ -62,7 +62,7 @@ class Part:
     is_of_variants : bool
         Whether the part is computed only when there are variants to compare with.
     group : str
-        Group of the tab: "See", "Measure", "Check" or "Explore".
+        Group of the tab: "See", "Measure", "Check", "Explore", or another one.
     work_ahead : function of Shot
         Starts work that depends on the layout before the shot is simulated.
     """

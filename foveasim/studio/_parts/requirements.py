@@ -13,13 +13,10 @@ from foveasim.metrics.registry import has_region
 from foveasim.studio._engine import Simulated
 from foveasim.studio._parts.registry import PartData, part
 
-#: Results that saturated photosites falsify.
-OF_SIGNALS = ("mean_code_dn", "psnr_db", "ssim", "snr", "snr_db", "snr_mean_db")
-
 
 def saturated_fraction(requirement: Requirement, result: Simulated) -> float:
     """Return the saturated fraction of the photosites of a requirement on signals, or 0."""
-    if requirement.measure not in OF_SIGNALS:
+    if not metric_info(requirement.measure).is_of_signals:
         return 0.0
     return result_of(replace(requirement, measure="saturated_fraction"), result.shot, result.capture)
 

@@ -4,7 +4,6 @@ import { $, find, make, notice } from "/web/page_parts.js";
 import { load } from "./modules.js";
 import { showRows } from "./splitters.js";
 
-const GROUPS = ["See", "Measure", "Check", "Explore"];
 // From this width, more tiles are shown at first.
 const WIDE = 1800;
 
@@ -48,14 +47,14 @@ export class Views {
     try { chosen = JSON.parse(localStorage.getItem("foveasim-studio-tiles") || "null"); } catch { /* the first ones */ }
     /** @type {(view: ViewAbout) => boolean} */
     const isFirst = innerWidth >= WIDE ? (view) => view.is_wide : (view) => view.is_first;
-    const groups = new Map(GROUPS.map((name) => [name, make("div")]));
+    const tiles = list.filter((each) => each.is_tile), groups = new Map(tiles.map(({ group }) => [group, make("div")]));
     for (const [name, group] of groups) {
       group.setAttribute("role", "group");
       group.setAttribute("aria-label", name);
       group.append(make("span", name, "quiet"));
     }
     $("tabs").replaceChildren(...groups.values());
-    for (const view of list.filter((each) => each.is_tile)) {
+    for (const view of tiles) {
       const tile = make("section", undefined, "tile"), button = make("button", view.label);
       tile.id = "tile-" + view.name;
       // Tiles scroll, also by keys.
