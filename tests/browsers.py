@@ -23,7 +23,7 @@ def open_chromium(browser_type, *more):
 
 def watch(page, problems, is_console_checked=True):
     """Append the errors of a page, and what it writes to the console, to a list."""
-    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("pageerror", lambda error: problems.append(str(error.stack or error)))
     if is_console_checked:
         page.on("console", lambda message: DRIVER_MESSAGE in message.text or problems.append(message.text))
 

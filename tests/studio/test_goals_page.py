@@ -44,6 +44,8 @@ def test_exposure_for_a_ratio_in_the_periphery(visit):
     until(page, "() => document.querySelector('#goal canvas')")
 
     assert "signal-to-noise ratio from 500 to 690 µm 10" in page.inner_text("#goal-text")
+    *_, at_least, at_most = page.locator("#goal .chart-legend li").all_inner_texts()
+    assert (at_least, at_most) == ("at least", "at most")  # the limits, which are not those of variant A
     shot = build_shot(None, page.evaluate("studio.state.settings"))
     capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
     limits = [{"measure": "snr", "at_least": 9.98, "at_most": 10.02, "annulus_um": [500.0, 690.0]}]

@@ -195,11 +195,11 @@ def test_hexagons_against_squares(keys):
         keys.press("Space")
         until(page, "name => studio.state.variants.find((each) => each.name === name).is_compared", name)
         keys.wait()
-    until(page, "() => document.querySelectorAll('#comparison th[scope=col]').length === 3")
+    until(page, "() => document.querySelectorAll('#comparison th[scope=col]').length === 4")
     keys.use("button[aria-label='Apply grid']")
     until(page, "() => studio.panes.b.sites.n === 900")
 
-    assert page.locator("#comparison th[scope=col]").all_inner_texts() == ["grid", "hexagonal", "B"]
+    assert page.locator("#comparison th[scope=col]").all_inner_texts() == ["grid", "hexagonal", "B", "B − grid"]
 
 
 def test_gaze_is_recorded_over_video(keys, tmp_path):

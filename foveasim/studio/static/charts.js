@@ -22,7 +22,9 @@ const LEFT = 46, RIGHT = 10;
 const DASHES = [[], [7, 3], [2, 2.5], [9, 3, 2, 3], [4, 3], [1, 4]];
 
 const theme = () => (document.documentElement.dataset.theme === "dark" ? 1 : 0);
-const inkOfCurve = (curve, k) => (NAMED[curve.name] || INKS[k % INKS.length])[theme()];
+const isMain = (curve) => !curve.isDashed && !curve.isLimit;
+/** @type {(curve: any, k: number) => string} */
+const inkOfCurve = (curve, k) => (k < 0 ? inkOf("--quiet") : (NAMED[curve.name] || INKS[k % INKS.length])[theme()]);
 export const axisTitle = (name, unit) => (unit ? name + " / " + unitText(unit) : name);
 
 function ticksOf(low, high, most) {
@@ -81,8 +83,8 @@ function decadeLimits(arrays) {
   return low === Infinity ? [1, 10] : [low, Math.max(high, 1.01 * low)];
 }
 
-// Curves y of x with their legend; those with isDashed are of variant A. Axes in "log" (such as "xy") are logarithmic; with
-// hasZero, others begin at zero.
+// Curves y of x with their legend; those with isDashed are of variant A, those with isLimit are limits of the others. Axes in
+// "log" (such as "xy") are logarithmic; with hasZero, others begin at zero.
 export class CurveChart {
   root; nameX; nameY; label; log; hasZero; marks = []; lines = [];
   // Conversion of numbers to CSS pixels, of the last drawing on the page.
@@ -106,13 +108,13 @@ export class CurveChart {
     this.canvas.addEventListener("pointerleave", () => { this.at = null; this.draw(); });
   }
 
-  // Curves: [{ label, name, unit_x, unit_y, x, y, isDashed }]; marks on them: [{ x, y, name, kind }], "end" for a bar,
+  // Curves: [{ label, name, unit_x, unit_y, x, y, isDashed, isLimit }]; marks on them: [{ x, y, name, kind }], "end" for a bar,
   // "point" for a small dot, else a dot; vertical lines: [{ x, label, of }].
   use(curves, { marks = [], lines = [], note = "" } = {}) {
     Object.assign(this, { curves, marks, lines });
     this.note.textContent = unitText(note);
     this.note.hidden = !note;
-    const own = curves.filter((curve) => !curve.isDashed);
+    const own = curves.filter(isMain);
     this.canvas.setAttribute("aria-label", this.label + ": "
       + (own.length
         ? own.map((curve) => curve.label + ", largest value " + shown(Number(limitsOf([curve.y])[1].toPrecision(3)))).join("; ")
@@ -135,11 +137,11 @@ export class CurveChart {
 
   // Draws the chart on its canvas, or a file, which has the legend in the drawing.
   paint(target) {
-    const { curves } = this, own = curves.filter((curve) => !curve.isDashed), left = 46, right = 10, bottom = 32;
+    const { curves } = this, own = curves.filter(isMain), left = 46, right = 10, bottom = 32;
     const top = target ? 8 + 15 * curves.length : 8;
     const indices = curves.map((curve) => own.findIndex((one) => one.label === curve.label));
     const inks = curves.map((curve, k) => inkOfCurve(curve, indices[k]));
-    const dashes = indices.map((k) => DASHES[Math.max(k, 0) % DASHES.length]);
+    const dashes = curves.map((curve, k) => DASHES[curve.isLimit ? 2 : Math.max(indices[k], 0) % DASHES.length]);
     const isLogX = this.log.includes("x"), isLogY = this.log.includes("y");
     const allX = [...curves.map((curve) => curve.x), this.marks.map((mark) => mark.x)];
     const axisX = axisOf(...(isLogX ? decadeLimits(allX) : limitsOf(allX)), isLogX);
@@ -192,7 +194,7 @@ export class CurveChart {
     context.textAlign = "left";
     curves.forEach((curve, k) => {
       context.strokeStyle = inks[k];
-      context.lineWidth = curve.isDashed ? 1 : 2;
+      context.lineWidth = isMain(curve) ? 2 : 1;
       context.setLineDash(dashes[k]);
       context.beginPath();
       let isDown = false;
@@ -222,7 +224,7 @@ export class CurveChart {
     this.curves.forEach((curve, k) => {
       const y = 12 + 15 * k;
       context.strokeStyle = inks[k];
-      context.lineWidth = curve.isDashed ? 1 : 2;
+      context.lineWidth = isMain(curve) ? 2 : 1;
       context.setLineDash(dashes[k]);
       context.beginPath();
       context.moveTo(50, y);
@@ -238,7 +240,7 @@ export class CurveChart {
   // Vertical lines in the colours of the curves of the same label, with a triangle on the axis.
   _drawLines(context, curves, inks, { toX, top, h, right }) {
     for (const line of this.lines) {
-      const k = curves.findIndex((curve) => curve.label === line.label && !curve.isDashed), x = Math.round(toX(line.x)) + 0.5;
+      const k = curves.findIndex((curve) => curve.label === line.label && isMain(curve)), x = Math.round(toX(line.x)) + 0.5;
       if (!(x <= right + 1)) continue;
       context.strokeStyle = context.fillStyle = k < 0 ? inkOf("--quiet") : inks[k];
       context.lineWidth = 1;
@@ -270,9 +272,9 @@ export class CurveChart {
 
   _listCurves(curves, inks, dashes, here, own) {
     const items = curves.map((curve, k) => {
-      const item = make("li"), swatch = swatchOf(inks[k], dashes[k], curve.isDashed);
+      const item = make("li"), swatch = swatchOf(inks[k], dashes[k], !isMain(curve));
       const value = here === null ? "" : " " + brief(Number(valueAt(curve, here).toPrecision(3)));
-      const line = curve.isDashed ? null : this.lines.find((one) => one.label === curve.label);
+      const line = isMain(curve) ? this.lines.find((one) => one.label === curve.label) : null;
       const text = (curve.isDashed ? "A: " : "") + curve.label + value
         + (line && here === null ? ", " + line.of + " " + quantity(line.x, own[0].unit_x, 3) : "");
       item.append(swatch, make("span", text));

@@ -60,7 +60,7 @@ export function create(root, studio) {
       /** @type {any} */
       const marks = [{ x: found.value, y: found.result, name: "", kind: "dot" }];
       const limits = found.limits.flatMap((limit, k) => (limit === null ? [] : [{ ...curve, label: ["at least", "at most"][k],
-        x: [xs[0], xs[xs.length - 1]], y: [limit, limit], isDashed: true }]));
+        x: [xs[0], xs[xs.length - 1]], y: [limit, limit], isLimit: true }]));
       chart.use([curve, ...limits], { marks });
     },
   };
