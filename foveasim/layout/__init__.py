@@ -55,9 +55,10 @@ from foveasim.layout.generators.voronoi_of import voronoi_of
 from foveasim.layout.generators.zones import zones
 from foveasim.layout.graph import SiteGraph, to_graph
 from foveasim.layout.model import Layout
-from foveasim.layout.optical_formats import OPTICAL_FORMATS, OpticalFormat
 from foveasim.layout.readout import nearest_bus, readout_by, readout_order
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.optical_formats import OPTICAL_FORMATS, OpticalFormat
+from foveasim.layout.sizes.site_counts import SolveFor
+from foveasim.layout.sizes.sizing import from_sizes
 from foveasim.layout.summary import Summary, describe
 
 __all__ = [
@@ -101,6 +102,7 @@ __all__ = [
     "fill",
     "foveal_cartesian",
     "fovi",
+    "from_sizes",
     "giotto",
     "giotto_ratio",
     "graph_colouring",

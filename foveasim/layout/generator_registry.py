@@ -17,7 +17,7 @@ from foveasim._core.registry import Registry
 from foveasim._core.validation import MAX_SITES
 from foveasim.errors import SimulationError, type_name
 from foveasim.layout.model import Layout
-from foveasim.layout.site_counts import SolveFor, layout_with_n_sites, select_unknown
+from foveasim.layout.sizes.site_counts import SolveFor, layout_with_n_sites, select_unknown
 
 __all__ = ["COUNT", "LAYOUTS", "SITES", "layout_generator"]
 

@@ -486,6 +486,7 @@ CALLS = {
     "layout.fill": lambda o: layout.fill(layout.cut_out(o.plain, SQUARE), SQUARE, size_um=1.0),
     "layout.foveal_cartesian": lambda o: layout.foveal_cartesian(n_rings=6, ring_ratio=1.3, pitch_um=2.0, n_fovea=3),
     "layout.fovi": lambda o: layout.fovi(fov_um=100.0, a_um=10.0, n_rings=8),
+    "layout.from_sizes": lambda o: layout.from_sizes("grid", n_sites=35, min_size_um=2.0),
     "layout.giotto": lambda o: layout.giotto(n_rho=5, n_theta=16, n_fovea=4, n_across=30, unit_um=2.0),
     "layout.giotto_ratio": lambda o: layout.giotto_ratio(n_rho=5, n_fovea=4, n_across=30),
     "layout.graph_colouring": lambda o: layout.graph_colouring(o.plain, 4),

@@ -13,7 +13,7 @@ from foveasim.errors import ParameterError
 from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.generators._annuli import points_of_outlines
 from foveasim.layout.model import Layout, layout_of
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.site_counts import SolveFor
 
 __all__ = ["foveal_cartesian"]
 

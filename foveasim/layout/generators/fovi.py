@@ -16,7 +16,7 @@ from foveasim.layout._regions import disc
 from foveasim.layout.diagrams.voronoi import voronoi_cells
 from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.model import Layout, layout_of
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.site_counts import SolveFor
 
 __all__ = ["fovi"]
 

@@ -14,7 +14,7 @@ from foveasim.errors import ParameterError
 from foveasim.layout.generator_registry import COUNT, layout_generator
 from foveasim.layout.lattice import RectangleLattice
 from foveasim.layout.model import Layout
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.site_counts import SolveFor
 
 __all__ = ["grid"]
 

@@ -13,7 +13,7 @@ from foveasim._core.validation import check_sites
 from foveasim.layout.generator_registry import COUNT, layout_generator
 from foveasim.layout.generators.grid import FILL_FACTOR, FIT_ROUNDING, check_field_um, linear_fill_factor
 from foveasim.layout.model import Layout
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.site_counts import SolveFor
 
 __all__ = ["hexagonal"]
 

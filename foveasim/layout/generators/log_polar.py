@@ -16,7 +16,7 @@ from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.generators._annuli import CHORDS, MIN_SITES_PER_RHO, Annuli, Fovea, Ring, annuli, fovea_rings
 from foveasim.layout.generators.tiling import with_hexagons
 from foveasim.layout.model import Layout, layout_of, valid_sites
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.site_counts import SolveFor
 
 __all__ = ["log_polar", "square_ring_ratio"]
 

@@ -13,7 +13,7 @@ from foveasim._core.validation import Bools, Ints, check_length_um, check_sites
 from foveasim.layout.generator_registry import COUNT, layout_generator
 from foveasim.layout.generators.grid import cells_in_field, guess_columns
 from foveasim.layout.model import Layout, layout_of
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.site_counts import SolveFor
 
 __all__ = ["octagonal"]
 

@@ -12,7 +12,7 @@ from foveasim._core.validation import MAX_SITES, Bools, Floats, Ints
 from foveasim.errors import ParameterError
 from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.model import Layout
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.site_counts import SolveFor
 
 __all__ = ["penrose"]
 

@@ -12,7 +12,7 @@ from foveasim._core.validation import Bools, Floats, Ints, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.model import Layout, layout_of
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.site_counts import SolveFor
 
 __all__ = ["quadtree"]
 

@@ -17,7 +17,7 @@ from foveasim.layout.drc.measurements import is_below_size
 from foveasim.layout.edits.all_sites import clip, merge_small, union
 from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.model import Layout, derived
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.site_counts import SolveFor
 
 __all__ = ["Cells", "fill", "tiling", "with_hexagons"]
 

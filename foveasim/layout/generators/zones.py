@@ -18,7 +18,7 @@ from foveasim.layout.generator_registry import layout_generator
 from foveasim.layout.generators.grid import square_corners_um
 from foveasim.layout.generators.tiling import Cells, tiling
 from foveasim.layout.model import Layout
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.site_counts import SolveFor
 
 __all__ = ["zones"]
 

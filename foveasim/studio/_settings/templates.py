@@ -10,6 +10,7 @@ from foveasim._core.registry import Registry
 from foveasim.distortion import LENSES
 from foveasim.errors import FoveasimError
 from foveasim.layout import EDITS, LAYOUTS, mosaic
+from foveasim.layout.sizes.sizing import SIZES, initial_parameters
 from foveasim.optics.pupils import PUPILS
 from foveasim.scene.registry import SCENES
 from foveasim.sensor import PIXEL_OPTICS
@@ -57,33 +58,26 @@ SECTIONS: dict[str, dict[str, Any]] = {
         "names": ["R", "G", "B"],
     },
     "fisheye kind": {"projection": "equidistant"},
-    "foveal_cartesian parameters": {"n_rings": 38, "ring_ratio": 1.1, "pitch_um": 5.0, "n_fovea": 10},
-    "fovi parameters": {"fov_um": 1300.0, "a_um": 50.0, "n_rings": 55},
     "gaussian kind": {"centre_nm": 550.0, "fwhm_nm": 150.0},
-    "giotto parameters": {"n_rho": 76, "n_theta": 128, "n_fovea": 20, "n_across": 600, "unit_um": 2.5},
     "graph_colouring kind": {"n_channels": 3},
     "grey_scale kind": {"patch_mm": 20.0},
-    "grid parameters": {"n_x": 120, "n_y": 120, "pitch_um": 8.0},
-    "hexagonal parameters": {"n_columns": 120, "n_rows": 138, "pitch_um": 8.0},
     "inset kind": {"margin_um": 0.1},
     "kernel kind": {"kernel": [[0.0, 0.01, 0.0], [0.01, 0.96, 0.01], [0.0, 0.01, 0.0]]},
     "lateral colour": {"wavelength_nm": [450.0, 550.0, 650.0], "magnification": [0.999, 1.0, 1.001]},
     "letter_f kind": {"height_mm": 150.0},
-    "log_polar parameters": {"n_sectors": 128, "min_size_um": 3.0, "r_max_um": 600.0, "fovea": "rings"},
+    "log_polar parameters": initial_parameters("log_polar") | {"fovea": "rings"},
     "merge_small kind": {"min_size_um": 2.0},
     "mosaic kind": {"block": ["RG", "GB"]},
-    "octagonal parameters": {"n_x": 100, "n_y": 100, "pitch_um": 10.0},
     "overlay kind": {
         "layer": {"generator": "grid", "parameters": {"n_x": 20, "n_y": 20, "pitch_um": 4.0}}, "operation": "replace",
     },
     "pass_band kind": {"from_nm": 420.0, "to_nm": 680.0},
-    "penrose parameters": {"size_um": 800.0, "side_um": 12.0},
     "point_grid kind": {"spacing_mm": 16.0, "pitch_um": 500.0},
     "point_sources kind": {"pixels": [[256, 256]]},
     "polynomial kind": {"wavelength_nm": [400.0, 500.0, 600.0, 700.0], "value": [0.3, 0.6, 0.6, 0.4], "degree": 3},
     "polynomial_fisheye kind": {"k": [0.0, 0.0, 0.0, 0.0]},
     "product kind": {"curves": [0.8, {"kind": "silicon", "depth_um": 3.0}]},
-    "quadtree parameters": {"importance": "skimage:camera", "pitch_um": 4.0, "n_levels": 5, "n_sites": 5000},
+    "quadtree parameters": initial_parameters("quadtree") | {"importance": "skimage:camera", "n_sites": 5000},
     "readout": {"frames_per_s": 30.0, "bits": 10},
     "random_channels kind": {"fractions": [1.0, 2.0, 1.0], "seed": 0},
     "relative illumination table": {"image_height_um": [0.0, 500.0, 1000.0], "fraction": [1.0, 0.95, 0.8]},
@@ -102,18 +96,15 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "spline kind": {"wavelength_nm": [400.0, 500.0, 600.0, 700.0], "value": [0.3, 0.6, 0.6, 0.4]},
     "split kind": {"n_x": 2, "n_y": 1},
     "step kind": {"edge_nm": [400.0, 500.0, 600.0, 700.0], "value": [0.3, 0.6, 0.4]},
-    "sunflower parameters": {"n_sites": 6000, "spacing_um": 8.0},
     "table kind": {"wavelength_nm": [400.0, 500.0, 600.0, 700.0], "value": [0.3, 0.6, 0.6, 0.4]},
-    "tiling parameters": {"pitch_um": 8.0, "radius_um": 450.0, "border": "drop"},
+    "tiling parameters": initial_parameters("tiling") | {"border": "drop"},
     "translate kind": {"dx_um": 10.0, "dy_um": 0.0},
-    "voronoi parameters": {"n_sites": 3000, "size_um": [600.0, 600.0]},
     "voronoi_of parameters": {
         "points_um": [[-200.0, -150.0], [180.0, -190.0], [-40.0, 20.0], [210.0, 110.0], [-180.0, 200.0], [60.0, 240.0]],
         "size_um": [600.0, 600.0],
     },
     "zernike": {"coefficients": {"4": 0.1}},
     "zone_plate kind": {"line_pairs_per_mm": 0.5},
-    "zones parameters": {"side_um": [256.0, 512.0, 1024.0], "pitch_um": [4.0, 8.0, 16.0]},
 }  # fmt: skip
 #: Initial values per µm² by parameter.
 PER_AREA: dict[str, float] = {
@@ -139,6 +130,8 @@ def templates(title: str) -> dict[str, Any]:
     if title in SECTIONS:
         return SECTIONS[title]
     name, _, word = title.rpartition(" ")
+    if word == "parameters" and name in SIZES:
+        return initial_parameters(name)
     for registry in REGISTRIES.get(word, ()):
         item = registry.get(name)
         example = None if item is None or item.__module__ == OF_POINTS else registry.example(name)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import copy
-import math
-import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from foveasim.errors import FoveasimError, ParameterError, SimulationError, printable
 from foveasim.layout import LAYOUTS, Layout
+from foveasim.layout.sizes.sizing import (
+    COLUMNS,
+    SIZES,
+    Sizes,
+    generated,
+    is_rectangular,
+    renumbered,
+    with_field,
+)
 from foveasim.studio._messages.models import MatchBudget, SolveFor, handles
-from foveasim.studio._settings.generator_fields import RECTANGULAR, with_field
 
 if TYPE_CHECKING:
     from foveasim.studio._session import Session
@@ -22,19 +26,11 @@ if TYPE_CHECKING:
 #: Key of the parameters of a generator.
 PARAMETERS = "layout.parameters"
 #: Generators of rows and columns, with the names of the numbers of columns and rows.
-RASTERS = {"grid": ("n_x", "n_y"), "hexagonal": ("n_columns", "n_rows"), "octagonal": ("n_x", "n_y")}
-#: Unknown of rasters whose numbers of columns and rows follow from the pitch.
-COLUMNS = "columns"
+RASTERS = {name: sizes.columns for name, sizes in SIZES.items() if sizes.columns is not None}
 #: Parameters of rasters that exclude each other.
 EXCLUDED = {"pitch_um": "size_um", "size_um": "pitch_um"}
-#: Parameters for which a generator solves only without another one.
-INSTEAD_OF = {"n_fovea": "pitch_um"}
 #: Settings of a layout that change what its generator returns.
 AFTER_GENERATOR = ("edits", "inset_um", "move_um", "snap_um")
-#: Largest difference of the number of sites, in percent, where generators have no nearer possible number.
-MAX_PERCENT = 8
-#: Margins of the field of a raster, relative to its pitch, that are tried so that the number of sites remains.
-MARGINS = (0.0, 0.1, 0.25, 0.5)
 
 
 def is_generated(settings: Mapping[str, Any]) -> bool:
@@ -52,7 +48,8 @@ def unknowns_of(settings: Mapping[str, Any]) -> dict[str, str]:
         found = {"pitch_um": "pitch", COLUMNS: "columns and rows"}
     else:
         parameters = settings["layout"].get("parameters") or {}
-        solvable = [each.name for each in _solvable(name) if parameters.get(INSTEAD_OF.get(each.name, "")) is None]
+        excludes = SIZES.get(name, Sizes()).excludes
+        solvable = [each.name for each in _solvable(name) if parameters.get(excludes.get(each.name, "")) is None]
         found = {each: _label(each) for each in solvable}
     return {"n_sites": "number of photosites", **found} if found else {}
 
@@ -75,8 +72,8 @@ def solved_of(settings: Mapping[str, Any], layout: Layout) -> dict[str, Any]:
         return {}
     generator, given = settings["layout"]["generator"], settings["layout"].get("parameters") or {}
     names = [*(each.name for each in _solvable(generator)), *RASTERS.get(generator, ())]
-    generated = _parameters_of(layout)
-    found = {name: generated[name] for name in names if given.get(name) is None and generated.get(name) is not None}
+    built = _parameters_of(layout)
+    found = {name: built[name] for name in names if given.get(name) is None and built.get(name) is not None}
     return {f"{PARAMETERS}.{name}": value for name, value in {**found, "n_sites": layout.n_sites}.items()}
 
 
@@ -95,7 +92,7 @@ def generated_layout(settings: Mapping[str, Any], shown: Layout | None, section:
     if LAYOUTS[layout["generator"]].picture is not None:  # type: ignore[attr-defined]
         return shown
     with suppress(FoveasimError, TypeError, ValueError):
-        return _generate(layout["generator"], layout.get("parameters") or {})
+        return generated(layout["generator"], layout.get("parameters") or {})
     return shown
 
 
@@ -187,94 +184,20 @@ def with_n_sites(
     if not is_generated(settings):
         raise ParameterError("layout", "must have a generator, whose number of photosites can be chosen")
     found = copy.deepcopy(dict(settings))
-    name = found["layout"]["generator"]
-    parameters = found["layout"].setdefault("parameters", {})
-    parameters.pop("n_sites", None)
-    solvable = _solvable(name)
-    if name in RASTERS:
-        candidates = (
-            list(_raster_candidates(name, parameters, layout, n_sites, unknown)) if is_resized else [parameters]
-        )
-    elif solvable:
-        given = [
-            each.name for each in solvable if parameters.get(each.name) is not None and unknown in (None, each.name)
-        ]
-        if not given and unknown is None:
-            raise ParameterError("layout", f"of {name} must contain {' or '.join(each.name for each in solvable)}")
-        candidates = [_but(parameters, other) for other in given or [str(unknown)]]
-    else:
-        candidates = [parameters]
-    chosen = candidates[0] | {"n_sites": n_sites}
-    if solvable and LAYOUTS[name].picture is None:  # type: ignore[attr-defined]
-        chosen = _nearest(name, candidates, n_sites) or chosen  # without any, the generator reports the reason
-    found["layout"]["parameters"] = chosen
+    section = found["layout"]
+    given = section.get("parameters") or {}
+    section["parameters"] = renumbered(section["generator"], given, n_sites, layout, unknown, is_resized=is_resized)
     return found
-
-
-def _raster_candidates(
-    generator: str, parameters: Mapping[str, Any], layout: Layout, n_sites: int, unknown: str | None
-) -> Iterator[dict[str, Any]]:
-    """Yield parameters of a raster without its number of sites, the best ones first."""
-    columns, rows = RASTERS[generator]
-    generated = _parameters_of(layout)
-    n_columns, n_rows = generated.get(columns) or 1, generated.get(rows)
-    x0_um, y0_um, x1_um, y1_um = layout.bounds_um
-    width_um, height_um = x1_um - x0_um, y1_um - y0_um
-    pitch_um = generated.get("pitch_um") or width_um / n_columns
-    if generator != "octagonal":  # whose rows alternate with diamonds
-        if generated.get("pitch_um") is None and n_columns > 1:
-            pitch_um = float(np.hypot(*(layout.centroid_um[1] - layout.centroid_um[0])))
-        n_rows = n_rows or max(1, round(layout.n_sites / n_columns))
-    if unknown == COLUMNS:
-        kept = _but(parameters, columns, rows, "size_um") | {"pitch_um": round(pitch_um, 6)}
-        if n_rows is not None:
-            yield kept | {rows: max(1, round(n_rows * math.sqrt(n_sites / layout.n_sites)))}
-        yield kept
-        return
-    kept = _but(parameters, columns, rows, "pitch_um", "pitch_y_um")
-    if parameters.get("size_um") is not None:
-        yield kept
-        return
-    if generator == "grid":  # outlines are smaller than the cells
-        width_um, height_um = n_columns * pitch_um, (n_rows or n_columns) * (generated.get("pitch_y_um") or pitch_um)
-        yield kept | {"size_um": [round(width_um, 6), round(height_um, 6)]}
-    for margin in MARGINS:
-        yield kept | {"size_um": [round(width_um + margin * pitch_um, 6), round(height_um + margin * pitch_um, 6)]}
-
-
-def _nearest(generator: str, candidates: list[dict[str, Any]], n_sites: int) -> dict[str, Any] | None:
-    """Return parameters with a possible number of sites, of rasters the nearest."""
-    for percent in sorted(range(-MAX_PERCENT, MAX_PERCENT + 1), key=abs):
-        found: list[tuple[int, dict[str, Any]]] = []
-        for parameters in candidates:
-            with suppress(FoveasimError, TypeError):
-                wanted = max(1, round(n_sites * (1.0 + 0.01 * percent)))
-                layout = _generate(generator, parameters | {"n_sites": wanted})
-                found.append(
-                    (abs(layout.n_sites - n_sites), parameters | {"n_sites": layout.n_sites if percent else n_sites})
-                )
-                if layout.n_sites == n_sites or generator not in RASTERS:
-                    break
-        if found:
-            return min(found, key=lambda each: each[0])[1]
-    return None
-
-
-def _generate(generator: str, parameters: Mapping[str, Any]) -> Layout:
-    """Return a layout; its warnings are those of the simulation that follows."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return LAYOUTS[generator](**parameters)
 
 
 def _with_solved(settings: Mapping[str, Any], layout: Layout) -> dict[str, Any]:
     """Return settings with the solved parameters instead of the number of sites."""
     found = copy.deepcopy(dict(settings))
-    parameters, generated = found["layout"].setdefault("parameters", {}), _parameters_of(layout)
+    parameters, built = found["layout"].setdefault("parameters", {}), _parameters_of(layout)
     parameters.pop("n_sites", None)
     for solvable in _solvable(found["layout"]["generator"]):
-        if parameters.get(solvable.name) is None and generated.get(solvable.name) is not None:
-            parameters[solvable.name] = generated[solvable.name]
+        if parameters.get(solvable.name) is None and built.get(solvable.name) is not None:
+            parameters[solvable.name] = built[solvable.name]
     return found
 
 
@@ -319,10 +242,10 @@ def _label(name: str) -> str:
 
 @handles(SolveFor)
 def _solve_for(session: Session, message: SolveFor) -> dict[str, Any]:
-    generated = session.layout_source()(session.history.settings)
-    if generated is None:
+    built = session.layout_source()(session.history.settings)
+    if built is None:
         raise SimulationError("there is no layout whose parameters are known")
-    return with_unknown(session.history.settings, message.name, generated)
+    return with_unknown(session.history.settings, message.name, built)
 
 
 def size_of(layout: Layout) -> tuple[float, float]:
@@ -351,5 +274,5 @@ def _match_budget(session: Session, message: MatchBudget) -> dict[str, Any]:
         found, own = copy.deepcopy(settings), layout_of(settings) or own
         generator, parameters = found["layout"]["generator"], found["layout"].get("parameters") or {}
         found["layout"]["parameters"] = with_field(generator, parameters, size_um, size_of(own))
-        return with_n_sites(found, n_sites, own, "pitch_um", is_resized=False) if generator in RECTANGULAR else found
+        return with_n_sites(found, n_sites, own, "pitch_um", is_resized=False) if is_rectangular(generator) else found
     return settings

@@ -7,10 +7,10 @@ from typing import Any
 from foveasim._io.yaml_files import first_comment
 from foveasim.layout import LAYOUTS, MOSAICS, OPTICAL_FORMATS
 from foveasim.layout.generator_registry import summary_of
+from foveasim.layout.sizes.sizing import N_SITES, is_rectangular, sizable
 from foveasim.sensor import PRESETS
 from foveasim.studio._engine import MAX_SITES
 from foveasim.studio._files import Files, preset_paths, presets, thumbnail_name
-from foveasim.studio._settings.generator_fields import RECTANGULAR
 from foveasim.studio._settings.templates import has_mosaic
 from foveasim.studio._start import new_sensor as sensors
 from foveasim.studio._start.recent import recent_files
@@ -19,7 +19,7 @@ from foveasim.studio._start.recent import recent_files
 INITIAL = {
     "generator": "log_polar",
     "format": "1/3",
-    "n_sites": sensors.N_SITES,
+    "n_sites": N_SITES,
     "frames_per_s": sensors.FRAMES_PER_S,
     "filters": sensors.BAYER,
     "electronics": "machine_vision",
@@ -35,7 +35,7 @@ def contents_of(files: Files) -> dict[str, Any]:
     directories = files.kept_directories
     return {
         "presets": [_with_description(each) for each in presets()],
-        "generators": [_generator(name) for name in sensors.generators()],
+        "generators": [_generator(name) for name in sizable()],
         "formats": [
             {
                 "name": name,
@@ -72,7 +72,7 @@ def _generator(name: str) -> dict[str, Any]:
         "name": name,
         "label": name.replace("_", " "),
         "text": f"{text[:1].upper()}{text[1:]}.",
-        "fills_format": name in RECTANGULAR,
+        "fills_format": is_rectangular(name),
         "has_mosaic": has_mosaic(name),
     }
 

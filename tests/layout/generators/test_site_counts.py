@@ -15,7 +15,7 @@ import foveasim as fs
 from foveasim.config import read_layout
 from foveasim.errors import ConfigError, LayoutWarning, ParameterError
 from foveasim.layout import LAYOUTS, layout_generator
-from foveasim.layout.site_counts import SolveFor
+from foveasim.layout.sizes.site_counts import SolveFor
 
 IMPORTANCE = np.array([[np.exp(-hypot(x, y) / 12.0) for x in range(-32, 32)] for y in range(-32, 32)])
 #: Families with their parameters, without the one that is solved for.

@@ -17,7 +17,7 @@ from foveasim._core.validation import MAX_SITES, check_count
 from foveasim.errors import FoveasimError, ParameterError, warn
 from foveasim.layout.model import Layout
 
-__all__ = ["SITE_TOLERANCE", "SolveFor", "layout_with_n_sites", "select_unknown"]
+__all__ = ["SITE_TOLERANCE", "CountError", "SolveFor", "layout_with_n_sites", "select_unknown"]
 
 #: Largest relative difference between the requested and the actual number of sites.
 SITE_TOLERANCE = 0.01
@@ -77,6 +77,14 @@ class SolveFor:
     at_least: int = 1
 
 
+class CountError(ParameterError):
+    """A number of sites that a generator cannot have; ``nearest`` is the nearest possible one."""
+
+    def __init__(self, nearest: int, rule: str, value: int, hint: str) -> None:
+        super().__init__("n_sites", rule, value, hint=hint)
+        self.nearest = nearest
+
+
 def select_unknown(generator: str, unknowns: Sequence[SolveFor], parameters: Mapping[str, Any]) -> SolveFor | None:
     """Return the parameter to solve for, or None when ``n_sites`` is not given."""
     free = [unknown for unknown in unknowns if parameters[unknown.name] is None]
@@ -117,8 +125,8 @@ def layout_with_n_sites(
     layout, value, caught = search.nearest_layout()
     if abs(layout.n_sites - target) > SITE_TOLERANCE * target:
         shown = f"{value:,}" if unknown.is_integer else f"{value:.6g}"
-        raise ParameterError(
-            "n_sites",
+        raise CountError(
+            layout.n_sites,
             f"of {generator} must be within {100 * SITE_TOLERANCE:g} % of a possible number",
             target,
             hint=f"the nearest is {layout.n_sites} with '{unknown.name}' = {shown}",
