@@ -7,7 +7,9 @@ and codes follow::
     import foveasim as fs
 
     layout = fs.layout.log_polar(n_sectors=128, min_size_um=2.0, r_max_um=600.0)
-    camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout))
+    camera = fs.Camera(
+        optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout)
+    )
     capture = camera.capture(scene, exposure_s=1 / 30, seed=0)
 """
 

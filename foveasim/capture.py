@@ -102,11 +102,21 @@ class Capture:
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
-    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision")
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
+    >>> sensor = fs.Sensor.from_preset(
+    ...     fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision"
+    ... )
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
     >>> capture = camera.capture(scene, exposure_s="auto", seed=0)
-    >>> capture.code.shape, capture.electrons.dtype, bool(0.6 < capture.code.mean() / 4095 < 0.8)
+    >>> (
+    ...     capture.code.shape,
+    ...     capture.electrons.dtype,
+    ...     bool(0.6 < capture.code.mean() / 4095 < 0.8),
+    ... )
     ((256,), dtype('int64'), True)
     """
 
@@ -182,9 +192,15 @@ class Capture:
         Examples
         --------
         >>> import foveasim as fs
-        >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision")
-        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-        >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+        >>> sensor = fs.Sensor.from_preset(
+        ...     fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision"
+        ... )
+        >>> camera = fs.Camera(
+        ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+        ... )
+        >>> scene = fs.Scene.flat(
+        ...     shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0
+        ... )
         >>> capture = camera.capture(scene, exposure_s="auto", seed=0)
         >>> capture.column("snr").shape, capture.column("expected_dn").dtype
         ((256,), dtype('float64'))
@@ -200,10 +216,18 @@ class Capture:
         Examples
         --------
         >>> import foveasim as fs
-        >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision")
-        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-        >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
-        >>> first, second = (camera.capture(scene, exposure_s=1e-3, seed=seed) for seed in (0, 1))
+        >>> sensor = fs.Sensor.from_preset(
+        ...     fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision"
+        ... )
+        >>> camera = fs.Camera(
+        ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+        ... )
+        >>> scene = fs.Scene.flat(
+        ...     shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0
+        ... )
+        >>> first, second = (
+        ...     camera.capture(scene, exposure_s=1e-3, seed=seed) for seed in (0, 1)
+        ... )
         >>> difference_dn = first.code_dn - second.code_dn
         >>> bool(difference_dn.min() < 0)
         True

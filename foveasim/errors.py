@@ -231,7 +231,9 @@ class SamplingWarning(FoveasimWarning):
     >>> import foveasim as fs
     >>> with warnings.catch_warnings():
     ...     warnings.simplefilter("ignore", fs.errors.SamplingWarning)
-    ...     chart = fs.scene.charts.siemens_star(shape=(64, 64), pitch_um=100.0, distance_m=1.0, luminance_cd_m2=100.0)
+    ...     chart = fs.scene.charts.siemens_star(
+    ...         shape=(64, 64), pitch_um=100.0, distance_m=1.0, luminance_cd_m2=100.0
+    ...     )
     >>> chart.basis.shape
     (1, 64, 64)
     """
@@ -248,8 +250,12 @@ class CoverageWarning(FoveasimWarning):
     >>> import warnings
     >>> import foveasim as fs
     >>> sensor = fs.Sensor(fs.layout.grid(n_x=32, n_y=32, pitch_um=3.0))
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-    >>> scene = fs.Scene.flat(shape=(40, 40), pitch_um=250.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
+    >>> scene = fs.Scene.flat(
+    ...     shape=(40, 40), pitch_um=250.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
     >>> with warnings.catch_warnings(record=True) as found:
     ...     warnings.simplefilter("always", fs.errors.CoverageWarning)
     ...     capture = camera.capture(scene, exposure_s=0.001, seed=0)
@@ -269,8 +275,12 @@ class ExposureWarning(FoveasimWarning):
     >>> import warnings
     >>> import foveasim as fs
     >>> sensor = fs.Sensor(fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), full_well_e=1e4)
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
     >>> with warnings.catch_warnings():
     ...     warnings.simplefilter("ignore", fs.errors.ExposureWarning)
     ...     capture = camera.capture(scene, exposure_s=10.0, seed=0)
@@ -338,7 +348,12 @@ def with_article(word: str) -> str:
 
     Examples
     --------
-    >>> with_article("Layout"), with_article("effect"), with_article("ndarray"), with_article("uint8")
+    >>> (
+    ...     with_article("Layout"),
+    ...     with_article("effect"),
+    ...     with_article("ndarray"),
+    ...     with_article("uint8"),
+    ... )
     ('a Layout', 'an effect', 'an ndarray', 'a uint8')
     """
     return f"{'an' if _VOWEL.match(word) and not _CONSONANT.match(word) else 'a'} {word}"

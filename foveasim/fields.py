@@ -379,7 +379,9 @@ class PowerMap:
 
         Examples
         --------
-        >>> spot = PowerMap.from_array([[0.0, 1.0], [0.0, 0.0]], pitch_um=2.0, wavelength_nm=550.0, top_row_first=True)
+        >>> spot = PowerMap.from_array(
+        ...     [[0.0, 1.0], [0.0, 0.0]], pitch_um=2.0, wavelength_nm=550.0, top_row_first=True
+        ... )
         >>> spot.data[0, 1].tolist(), spot.grid.origin_um
         ([0.0, 1.0], (-2.0, -2.0))
         """

@@ -71,7 +71,9 @@ class ChiefRayTable:
 
     Examples
     --------
-    >>> table = ChiefRayTable(image_height_um=(0.0, 1000.0, 2000.0), angle_deg=(0.0, 15.0, 25.0))
+    >>> table = ChiefRayTable(
+    ...     image_height_um=(0.0, 1000.0, 2000.0), angle_deg=(0.0, 15.0, 25.0)
+    ... )
     >>> table.tangents([[0.0, 1000.0]]).round(4).tolist()  # 15 degrees upwards
     [[0.0, 0.2679]]
     """
@@ -177,7 +179,9 @@ class Incidence:
 
     Examples
     --------
-    >>> cone = Incidence(np.array([[0.0, 0.0], [1000.0, 0.0]]), radius=0.125, exit_pupil_um=8000.0)
+    >>> cone = Incidence(
+    ...     np.array([[0.0, 0.0], [1000.0, 0.0]]), radius=0.125, exit_pupil_um=8000.0
+    ... )
     >>> cone.chief_ray.tolist(), cone.tangents.shape
     ([[0.0, 0.0], [0.125, 0.0]], (2, 7, 2))
     """

@@ -4,7 +4,9 @@ Captures of sensors that are larger than memory, in tiles.
 A tile is a range of consecutive photosites. The spectra of the scene's images are in memory once; for each tile, the rows of
 the power map under its sites are computed, integrated, exposed and released::
 
-    capture = fs.tiles.write_tiles("wafer.zarr", camera, scene, exposure_s=0.01, seed=0, progress=True)
+    capture = fs.tiles.write_tiles(
+        "wafer.zarr", camera, scene, exposure_s=0.01, seed=0, progress=True
+    )
     capture.code[:1000]  # a zarr array, read in parts
 
 The draws of a site depend on its index in the layout, so that tiles have the noise of the complete capture, for any size of the
@@ -133,10 +135,18 @@ def capture_tiles(
     Examples
     --------
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=300, n_y=300, pitch_um=2.0), "machine_vision")
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=1500.0, distance_m=1.0, illuminance_lux=500.0)
-    >>> tiles = fs.tiles.capture_tiles(camera, scene, exposure_s=0.001, seed=0, tile_sites=65_536)
+    >>> sensor = fs.Sensor.from_preset(
+    ...     fs.layout.grid(n_x=300, n_y=300, pitch_um=2.0), "machine_vision"
+    ... )
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=1500.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
+    >>> tiles = fs.tiles.capture_tiles(
+    ...     camera, scene, exposure_s=0.001, seed=0, tile_sites=65_536
+    ... )
     >>> [tile.code.size for tile in tiles]
     [65536, 24464]
     """
@@ -436,11 +446,19 @@ def write_tiles(
     >>> import tempfile
     >>> from pathlib import Path
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=20, n_y=20, pitch_um=3.0), "machine_vision")
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=400.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> sensor = fs.Sensor.from_preset(
+    ...     fs.layout.grid(n_x=20, n_y=20, pitch_um=3.0), "machine_vision"
+    ... )
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=400.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
     >>> with tempfile.TemporaryDirectory() as directory:
-    ...     fs.tiles.write_tiles(Path(directory, "wall.zarr"), camera, scene, exposure_s=0.001, seed=0)
+    ...     fs.tiles.write_tiles(
+    ...         Path(directory, "wall.zarr"), camera, scene, exposure_s=0.001, seed=0
+    ...     )
     TiledCapture(400 sites in 1 tiles, 12 bits, 'wall.zarr')
     """
     target = Path(path)
@@ -500,11 +518,19 @@ def read_tiles(path: str | Path) -> TiledCapture:
     >>> import tempfile
     >>> from pathlib import Path
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=20, n_y=20, pitch_um=3.0), "machine_vision")
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=400.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> sensor = fs.Sensor.from_preset(
+    ...     fs.layout.grid(n_x=20, n_y=20, pitch_um=3.0), "machine_vision"
+    ... )
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=400.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
     >>> with tempfile.TemporaryDirectory() as directory:
-    ...     _ = fs.tiles.write_tiles(Path(directory, "wall.zarr"), camera, scene, exposure_s=0.001, seed=0)
+    ...     _ = fs.tiles.write_tiles(
+    ...         Path(directory, "wall.zarr"), camera, scene, exposure_s=0.001, seed=0
+    ...     )
     ...     print(fs.tiles.read_tiles(Path(directory, "wall.zarr")).code[100:104].dtype)
     uint16
     """

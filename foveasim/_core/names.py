@@ -77,7 +77,9 @@ def list_names(names: Collection[str], name: object = "") -> str:
     --------
     >>> list_names(["grid", "giotto"])
     "'grid', 'giotto'"
-    >>> list_names([f"name_{k}" for k in range(40)], "name_7").endswith("(16 closest of 40)")
+    >>> list_names([f"name_{k}" for k in range(40)], "name_7").endswith(
+    ...     "(16 closest of 40)"
+    ... )
     True
     """
     if len(names) <= MAX_LISTED:

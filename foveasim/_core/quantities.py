@@ -18,9 +18,17 @@ def format_quantity(values: float | Sequence[float], unit: str, *, digits: int =
 
     Examples
     --------
-    >>> format_quantity(9e-15, "F"), format_quantity(1 / 30, "s", digits=3), format_quantity([4e-16, 2e-13], "F")
+    >>> (
+    ...     format_quantity(9e-15, "F"),
+    ...     format_quantity(1 / 30, "s", digits=3),
+    ...     format_quantity([4e-16, 2e-13], "F"),
+    ... )
     ('9 fF', '33.3 ms', '0.4 to 200 fF')
-    >>> format_quantity(10700.4, "e-"), format_quantity(2.5e6, "µm²"), format_quantity(0.85, "")
+    >>> (
+    ...     format_quantity(10700.4, "e-"),
+    ...     format_quantity(2.5e6, "µm²"),
+    ...     format_quantity(0.85, ""),
+    ... )
     ('10,700 e-', '2.5 mm²', '0.85')
     """
     numbers = [float(value) for value in (values if isinstance(values, Sequence) else [values])]

@@ -101,9 +101,15 @@ class Camera:
     --------
     >>> import foveasim as fs
     >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout))
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout)
+    ... )
     >>> scene = fs.Scene.flat(
-    ...     shape=(200, 200), pitch_um=10.0, distance_m=0.5, radiance_w_m2_sr_nm=0.1, band_width_nm=10.0
+    ...     shape=(200, 200),
+    ...     pitch_um=10.0,
+    ...     distance_m=0.5,
+    ...     radiance_w_m2_sr_nm=0.1,
+    ...     band_width_nm=10.0,
     ... )
     >>> camera.capture(scene, exposure_s=0.01, seed=0).code.shape
     (64,)
@@ -257,8 +263,12 @@ class Camera:
         >>> import numpy as np
         >>> optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
         >>> wide, high = (fs.layout.grid(n_x=n, n_y=60 - n, pitch_um=1.0) for n in (40, 20))
-        >>> cameras = [fs.Camera(optics=optics, sensor=fs.Sensor(layout)) for layout in (wide, high)]
-        >>> scene = fs.Scene.from_picture(np.ones((10, 10)), fit="cover", distance_m=1.0, illuminance_lux=500.0)
+        >>> cameras = [
+        ...     fs.Camera(optics=optics, sensor=fs.Sensor(layout)) for layout in (wide, high)
+        ... ]
+        >>> scene = fs.Scene.from_picture(
+        ...     np.ones((10, 10)), fit="cover", distance_m=1.0, illuminance_lux=500.0
+        ... )
         >>> framed = cameras[0].fit_scene(scene, others=cameras[1:])
         >>> [round(camera.image_grid(framed).bounds_um[2], 6) for camera in cameras]
         [20.0, 20.0]
@@ -483,7 +493,9 @@ class Camera:
         --------
         >>> import foveasim as fs
         >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
-        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout))
+        >>> camera = fs.Camera(
+        ...     optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout)
+        ... )
         >>> camera.with_gaze((20.0, -5.0)).gaze_um
         (20.0, -5.0)
         """
@@ -599,10 +611,18 @@ class Camera:
         Examples
         --------
         >>> import foveasim as fs
-        >>> sensor = fs.Sensor(fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0), full_well_e=1e4, capacitance_f=6e-16)
-        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=sensor)
+        >>> sensor = fs.Sensor(
+        ...     fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0), full_well_e=1e4, capacitance_f=6e-16
+        ... )
+        >>> camera = fs.Camera(
+        ...     optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=sensor
+        ... )
         >>> scene = fs.Scene.flat(
-        ...     shape=(200, 200), pitch_um=10.0, distance_m=0.5, illuminance_lux=500.0, band_width_nm=100.0
+        ...     shape=(200, 200),
+        ...     pitch_um=10.0,
+        ...     distance_m=0.5,
+        ...     illuminance_lux=500.0,
+        ...     band_width_nm=100.0,
         ... )
         >>> exposure_s = camera.auto_exposure(scene, target=0.5)
         >>> capture = camera.capture(scene, exposure_s=exposure_s, seed=0)
@@ -710,9 +730,15 @@ class Camera:
         --------
         >>> import foveasim as fs
         >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
-        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout))
+        >>> camera = fs.Camera(
+        ...     optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout)
+        ... )
         >>> scene = fs.Scene.flat(
-        ...     shape=(200, 200), pitch_um=10.0, distance_m=0.5, radiance_w_m2_sr_nm=0.1, band_width_nm=10.0
+        ...     shape=(200, 200),
+        ...     pitch_um=10.0,
+        ...     distance_m=0.5,
+        ...     radiance_w_m2_sr_nm=0.1,
+        ...     band_width_nm=10.0,
         ... )
         >>> [c.settings["frame"] for c in camera.video([scene, scene], exposure_s=0.01, seed=0)]
         [0, 1]
@@ -861,8 +887,12 @@ class Camera:
         --------
         >>> import foveasim as fs
         >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8, exit_pupil_mm=10.0)
-        >>> camera = fs.Camera(optics=lens, sensor=fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=200.0)))
-        >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+        >>> camera = fs.Camera(
+        ...     optics=lens, sensor=fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=200.0))
+        ... )
+        >>> scene = fs.Scene.flat(
+        ...     shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0
+        ... )
         >>> cones = camera.incidence(scene)
         >>> cones.image_height_um.tolist(), cones.chief_ray.tolist()
         ([100.0, 100.0], [[-0.01, 0.0], [0.01, 0.0]])
@@ -911,8 +941,12 @@ class Camera:
         >>> import foveasim as fs
         >>> stack = fs.sensor.ApertureStack(height_um=4.0, refractive_index=1.5)
         >>> sensor = fs.Sensor(fs.layout.grid(n_x=3, n_y=1, pitch_um=4.0), pixel_optics=stack)
-        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-        >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=50.0, distance_m=1.0, illuminance_lux=500.0)
+        >>> camera = fs.Camera(
+        ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+        ... )
+        >>> scene = fs.Scene.flat(
+        ...     shape=(64, 64), pitch_um=50.0, distance_m=1.0, illuminance_lux=500.0
+        ... )
         >>> camera.angular_response(scene).round(2).tolist()
         [0.9, 0.9, 0.9]
         """

@@ -93,12 +93,24 @@ def quality_by_eccentricity(
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> grid, layout = fs.Grid.centred((32, 32), 2.0), fs.layout.grid(n_x=16, n_y=16, pitch_um=4.0)
+    >>> grid, layout = (
+    ...     fs.Grid.centred((32, 32), 2.0),
+    ...     fs.layout.grid(n_x=16, n_y=16, pitch_um=4.0),
+    ... )
     >>> irradiance = 1.0 + 0.2 * np.sin(0.3 * np.arange(32.0)) * np.ones((32, 1))  # W/m²
-    >>> reference = fs.reconstruct.reference(fs.PowerMap.from_array(irradiance, pitch_um=2.0, wavelength_nm=550.0), grid)
-    >>> picture = fs.reconstruct.linear(layout, fs.Integrator(layout, grid)(irradiance), grid)
-    >>> quality = fs.compare.quality_by_eccentricity(picture, reference, edges_um=np.array([0.0, 16.0, 32.0]))
-    >>> quality.psnr_db_by_eccentricity.round(1).tolist(), round(float(quality.gain), 3)  # gain of 1/16: sites have 16 µm²
+    >>> reference = fs.reconstruct.reference(
+    ...     fs.PowerMap.from_array(irradiance, pitch_um=2.0, wavelength_nm=550.0), grid
+    ... )
+    >>> picture = fs.reconstruct.linear(
+    ...     layout, fs.Integrator(layout, grid)(irradiance), grid
+    ... )
+    >>> quality = fs.compare.quality_by_eccentricity(
+    ...     picture, reference, edges_um=np.array([0.0, 16.0, 32.0])
+    ... )
+    >>> (
+    ...     quality.psnr_db_by_eccentricity.round(1).tolist(),
+    ...     round(float(quality.gain), 3),
+    ... )  # gain of 1/16: sites have 16 µm²
     ([36.1, 34.1], 0.063)
     """
     if picture.grid != reference.grid:

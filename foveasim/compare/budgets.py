@@ -67,7 +67,9 @@ def budget_of(camera: Camera, frames_per_s: Annotated[float, POSITIVE]) -> Budge
     --------
     >>> import foveasim as fs
     >>> sensor = fs.Sensor(fs.layout.grid(n_x=20, n_y=10, pitch_um=3.0), bits=12)
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
     >>> budget = fs.compare.budget_of(camera, 30.0)
     >>> budget.n_sites, budget.data_rate_bit_per_s, round(budget.area_um2)
     (200, 72000.0, 1800)

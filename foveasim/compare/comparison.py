@@ -369,9 +369,16 @@ def cameras(
     >>> optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
     >>> layouts = {"grid": fs.layout.grid(n_x=20, n_y=20, pitch_um=4.0)}
     >>> layouts["hexagonal"] = fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=4.3)
-    >>> cameras = {name: fs.Camera(optics=optics, sensor=fs.compare.default_sensor(layouts[name])) for name in layouts}
-    >>> scene = fs.Scene.flat(shape=(40, 40), pitch_um=400.0, distance_m=1.0, illuminance_lux=500.0)
-    >>> found = fs.compare.cameras(cameras, {"wall": scene}, exposure_s=0.01, n_annuli=2, max_pixels=32)
+    >>> cameras = {
+    ...     name: fs.Camera(optics=optics, sensor=fs.compare.default_sensor(layouts[name]))
+    ...     for name in layouts
+    ... }
+    >>> scene = fs.Scene.flat(
+    ...     shape=(40, 40), pitch_um=400.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
+    >>> found = fs.compare.cameras(
+    ...     cameras, {"wall": scene}, exposure_s=0.01, n_annuli=2, max_pixels=32
+    ... )
     >>> {name: round(budget.area_um2) for name, budget in zip(found.names, found.budgets)}
     {'grid': 6400, 'hexagonal': 6405}
     """
@@ -538,7 +545,9 @@ def layouts(
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = fs.scene.charts.slanted_edge(shape=(64, 64), pitch_um=250.0, distance_m=1.0, luminance_cd_m2=100.0)
+    >>> scene = fs.scene.charts.slanted_edge(
+    ...     shape=(64, 64), pitch_um=250.0, distance_m=1.0, luminance_cd_m2=100.0
+    ... )
     >>> layouts = {"grid": fs.layout.grid(n_x=20, n_y=20, pitch_um=4.0)}
     >>> layouts["hexagonal"] = fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=4.3)
     >>> found = fs.compare.layouts(layouts, {"edge": scene}, n_annuli=2, max_pixels=40)

@@ -357,7 +357,9 @@ def site_information_bits(
     >>> covariance = fs.compare.SceneCovariance([1.0], [5.0])
     >>> for pitch_um in (2.0, 4.0):
     ...     layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=pitch_um)
-    ...     bits = fs.compare.site_information_bits(layout, covariance, layout.area_um2, np.ones((1, 64)))
+    ...     bits = fs.compare.site_information_bits(
+    ...         layout, covariance, layout.area_um2, np.ones((1, 64))
+    ...     )
     ...     print(f"{bits.sum():.0f} bit")
     37 bit
     157 bit

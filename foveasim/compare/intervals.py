@@ -125,7 +125,11 @@ def format_interval(median: float, low: float, high: float) -> str:
 
     Examples
     --------
-    >>> format_interval(25.123, 24.6, 26.31), format_interval(25.123, 25.123, 25.123), format_interval(float("nan"), 0, 1)
+    >>> (
+    ...     format_interval(25.123, 24.6, 26.31),
+    ...     format_interval(25.123, 25.123, 25.123),
+    ...     format_interval(float("nan"), 0, 1),
+    ... )
     ('25.12 [24.60, 26.31]', '25.12', '–')
     """
     if not np.isfinite(median):

@@ -103,9 +103,13 @@ def photograph_scenes(
     >>> import foveasim as fs
     >>> import numpy as np
     >>> pictures = {"ramp": np.tile(np.arange(64, dtype=np.uint8), (48, 1))}
-    >>> scenes = fs.compare.photograph_scenes(200.0, pictures=pictures)  # cropped to 48 x 48 pixels
+    >>> scenes = fs.compare.photograph_scenes(
+    ...     200.0, pictures=pictures
+    ... )  # cropped to 48 x 48 pixels
     >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8)
-    >>> round(scenes["ramp"].pitch_um * 48 * lens.magnification(1.0), 1)  # image size, 4 % larger than the field
+    >>> round(
+    ...     scenes["ramp"].pitch_um * 48 * lens.magnification(1.0), 1
+    ... )  # image size, 4 % larger than the field
     208.0
     """
     optics = default_optics() if optics is None else optics

@@ -54,7 +54,9 @@ def compare_files(
     Examples
     --------
     >>> import foveasim as fs
-    >>> found = fs.config.compare_files(["foveal.yaml", "square.yaml"], budget="data_rate")  # doctest: +SKIP
+    >>> found = fs.config.compare_files(
+    ...     ["foveal.yaml", "square.yaml"], budget="data_rate"
+    ... )  # doctest: +SKIP
     >>> found.write("report.html")  # doctest: +SKIP
     """
     if len(paths) < 2:

@@ -260,13 +260,24 @@ def build_shot(
     --------
     >>> import foveasim as fs
     >>> settings = {
-    ...     "scene": {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0},
+    ...     "scene": {
+    ...         "kind": "flat",
+    ...         "shape": [60, 60],
+    ...         "pitch_um": 300.0,
+    ...         "distance_m": 1.0,
+    ...         "illuminance_lux": 500.0,
+    ...     },
     ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
-    ...     "layout": {"generator": "grid", "parameters": {"n_x": 16, "n_y": 16, "pitch_um": 3.0}},
+    ...     "layout": {
+    ...         "generator": "grid",
+    ...         "parameters": {"n_x": 16, "n_y": 16, "pitch_um": 3.0},
+    ...     },
     ...     "exposure_s": "auto",
     ... }
     >>> shot = fs.config.build_shot(None, settings)
-    >>> shot.camera.capture(shot.scene, exposure_s=shot.requested_s, seed=shot.seed).code.shape
+    >>> shot.camera.capture(
+    ...     shot.scene, exposure_s=shot.requested_s, seed=shot.seed
+    ... ).code.shape
     (256,)
     """
     source = Source.of(source)

@@ -66,7 +66,9 @@ def to_python(settings: Mapping[str, Any], *, source: Source | str | Path | None
     --------
     >>> from foveasim.config import demo_settings, read_settings, to_python
     >>> path = demo_settings()[0]
-    >>> "optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)" in to_python(read_settings(path), source=path)
+    >>> "optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)" in to_python(
+    ...     read_settings(path), source=path
+    ... )
     True
     """
     source = Source.of(source)

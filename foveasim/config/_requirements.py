@@ -60,7 +60,9 @@ class RegionResult:
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.config.RegionResult(measure="mtf", frequency_per_mm=50.0, annulus_um=(0.0, 100.0)).subject
+    >>> fs.config.RegionResult(
+    ...     measure="mtf", frequency_per_mm=50.0, annulus_um=(0.0, 100.0)
+    ... ).subject
     'MTF of lens and photosite at 50 per mm from 0 to 100 µm'
     """
 
@@ -154,7 +156,9 @@ class Requirement(RegionResult):
     Examples
     --------
     >>> import foveasim as fs
-    >>> print(fs.config.Requirement(measure="snr", at_least=10.0, annulus_um=(400.0, 600.0)))
+    >>> print(
+    ...     fs.config.Requirement(measure="snr", at_least=10.0, annulus_um=(400.0, 600.0))
+    ... )
     signal-to-noise ratio from 400 to 600 µm: at least 10
     """
 

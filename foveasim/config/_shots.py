@@ -132,13 +132,24 @@ def run_shot(shot: Shot, directory: str | Path) -> tuple[Result, list[Path]]:
     >>> import tempfile
     >>> import foveasim as fs
     >>> settings = {
-    ...     "scene": {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0},
+    ...     "scene": {
+    ...         "kind": "flat",
+    ...         "shape": [60, 60],
+    ...         "pitch_um": 300.0,
+    ...         "distance_m": 1.0,
+    ...         "illuminance_lux": 500.0,
+    ...     },
     ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
-    ...     "layout": {"generator": "grid", "parameters": {"n_x": 16, "n_y": 16, "pitch_um": 3.0}},
+    ...     "layout": {
+    ...         "generator": "grid",
+    ...         "parameters": {"n_x": 16, "n_y": 16, "pitch_um": 3.0},
+    ...     },
     ...     "exposure_s": "auto",
     ... }
     >>> with tempfile.TemporaryDirectory() as directory:
-    ...     result, paths = fs.config.run_shot(fs.config.build_shot("wall", settings), directory)
+    ...     result, paths = fs.config.run_shot(
+    ...         fs.config.build_shot("wall", settings), directory
+    ...     )
     ...     print([path.name for path in paths])
     ['wall_picture.png', 'wall_layout.png', 'wall_capture.npz']
     """

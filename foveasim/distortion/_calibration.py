@@ -62,7 +62,9 @@ def from_opencv(
     --------
     >>> import foveasim as fs
     >>> matrix = [[1000.0, 0.0, 320.0], [0.0, 1000.0, 240.0], [0.0, 0.0, 1.0]]
-    >>> lens = fs.distortion.from_opencv(matrix, [-0.2, 0.05, 0.0, 0.0], image_size=(640, 480), pixel_um=3.0)
+    >>> lens = fs.distortion.from_opencv(
+    ...     matrix, [-0.2, 0.05, 0.0, 0.0], image_size=(640, 480), pixel_um=3.0
+    ... )
     >>> float(lens.distort([[600.0, 0.0]])[0, 0].round(1))
     595.3
     """
@@ -106,7 +108,9 @@ def to_opencv(
     --------
     >>> import foveasim as fs
     >>> lens = fs.distortion.BrownConrady(k1=-0.2, k2=0.05, focal_um=3000.0)
-    >>> matrix, coefficients = fs.distortion.to_opencv(lens, image_size=(640, 480), pixel_um=3.0)
+    >>> matrix, coefficients = fs.distortion.to_opencv(
+    ...     lens, image_size=(640, 480), pixel_um=3.0
+    ... )
     >>> matrix.tolist(), coefficients[:2].tolist()
     ([[1000.0, 0.0, 319.5], [0.0, 1000.0, 239.5], [0.0, 0.0, 1.0]], [-0.2, 0.05])
     """

@@ -149,7 +149,8 @@ def read_calibration(
     >>> import tempfile
     >>> from pathlib import Path
     >>> import foveasim as fs
-    >>> text = "camera_matrix: [[1000, 0, 320], [0, 1000, 240], [0, 0, 1]]\ndistortion_coefficients: [-0.2, 0.05, 0, 0]\n"
+    >>> matrix = "[[1000, 0, 320], [0, 1000, 240], [0, 0, 1]]"
+    >>> text = f"camera_matrix: {matrix}\ndistortion_coefficients: [-0.2, 0.05, 0, 0]\n"
     >>> with tempfile.TemporaryDirectory() as directory:
     ...     path = Path(directory, "calibration.yaml")
     ...     _ = path.write_text(text)

@@ -157,7 +157,9 @@ class PolynomialFisheye(_AngularLens):
     Examples
     --------
     >>> import foveasim as fs
-    >>> lens = fs.distortion.PolynomialFisheye(k=(0.0, 0.0, 0.0, 0.0), focal_um=2000.0)  # equidistant: r = f θ
+    >>> lens = fs.distortion.PolynomialFisheye(
+    ...     k=(0.0, 0.0, 0.0, 0.0), focal_um=2000.0
+    ... )  # equidistant: r = f θ
     >>> lens.distort([[2000.0, 0.0]]).round(1).tolist()  # 45 degrees
     [[1570.8, 0.0]]
     """
@@ -233,7 +235,9 @@ class Scaramuzza(_AngularLens):
     Examples
     --------
     >>> import foveasim as fs
-    >>> lens = fs.distortion.Scaramuzza(a=(700.0, -4e-4, 0.0, 0.0), pixel_um=3.0, focal_um=2100.0)
+    >>> lens = fs.distortion.Scaramuzza(
+    ...     a=(700.0, -4e-4, 0.0, 0.0), pixel_um=3.0, focal_um=2100.0
+    ... )
     >>> lens.distort([[900.0, 0.0]]).round(1).tolist()
     [[857.9, 0.0]]
     """

@@ -25,7 +25,10 @@ class Lens(Protocol):
     --------
     >>> import foveasim as fs
     >>> lens = fs.distortion.BrownConrady(focal_um=8000.0, k1=-0.1)
-    >>> isinstance(lens, fs.distortion.Lens), lens.distort([[1000.0, 0.0]]).round(2).tolist()
+    >>> (
+    ...     isinstance(lens, fs.distortion.Lens),
+    ...     lens.distort([[1000.0, 0.0]]).round(2).tolist(),
+    ... )
     (True, [[998.44, 0.0]])
     """
 

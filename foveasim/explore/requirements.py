@@ -68,12 +68,24 @@ def check_requirements(shot: Shot, capture: Capture) -> list[CheckedRequirement]
     --------
     >>> import foveasim as fs
     >>> settings = {
-    ...     "scene": {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0},
+    ...     "scene": {
+    ...         "kind": "flat",
+    ...         "shape": [60, 60],
+    ...         "pitch_um": 300.0,
+    ...         "distance_m": 1.0,
+    ...         "illuminance_lux": 500.0,
+    ...     },
     ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
-    ...     "layout": {"generator": "grid", "parameters": {"n_x": 16, "n_y": 16, "pitch_um": 3.0}},
+    ...     "layout": {
+    ...         "generator": "grid",
+    ...         "parameters": {"n_x": 16, "n_y": 16, "pitch_um": 3.0},
+    ...     },
     ...     "sensor": {"preset": "machine_vision"},
     ...     "exposure_s": 0.002,
-    ...     "requirements": [{"measure": "snr", "at_least": 20}, {"measure": "n_sites", "at_most": 200}],
+    ...     "requirements": [
+    ...         {"measure": "snr", "at_least": 20},
+    ...         {"measure": "n_sites", "at_most": 200},
+    ...     ],
     ... }
     >>> shot = fs.config.build_shot(None, settings)
     >>> capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=0)
@@ -94,7 +106,12 @@ def result_of(result: RegionResult, shot: Shot, capture: Capture) -> float:
     >>> import foveasim as fs
     >>> shot = fs.config.read_shot(fs.config.demo_settings()[0])
     >>> capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=0)
-    >>> round(fs.explore.result_of(fs.config.RegionResult(measure="smallest_size_um"), shot, capture), 1)
+    >>> round(
+    ...     fs.explore.result_of(
+    ...         fs.config.RegionResult(measure="smallest_size_um"), shot, capture
+    ...     ),
+    ...     1,
+    ... )
     6.0
     """
     region = result if result.has_region else None
@@ -117,9 +134,13 @@ class ResultMetric:
     Examples
     --------
     >>> import foveasim as fs
-    >>> fovea = fs.explore.ResultMetric(fs.config.RegionResult(measure="snr", annulus_um=(0.0, 200.0)))
+    >>> fovea = fs.explore.ResultMetric(
+    ...     fs.config.RegionResult(measure="snr", annulus_um=(0.0, 200.0))
+    ... )
     >>> shot = fs.config.demo_settings()[0]
-    >>> found = fs.explore.sweep(shot, {"exposure_s": [0.01, 0.02]}, metrics={"fovea_snr": fovea}, workers=0)
+    >>> found = fs.explore.sweep(
+    ...     shot, {"exposure_s": [0.01, 0.02]}, metrics={"fovea_snr": fovea}, workers=0
+    ... )
     >>> found["fovea_snr"].shape
     (2,)
     """

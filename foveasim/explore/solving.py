@@ -89,9 +89,18 @@ def solve(
 
     >>> import foveasim as fs
     >>> settings = {
-    ...     "scene": {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0},
+    ...     "scene": {
+    ...         "kind": "flat",
+    ...         "shape": [60, 60],
+    ...         "pitch_um": 300.0,
+    ...         "distance_m": 1.0,
+    ...         "illuminance_lux": 500.0,
+    ...     },
     ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
-    ...     "layout": {"generator": "grid", "parameters": {"n_x": 16, "n_y": 16, "pitch_um": 3.0}},
+    ...     "layout": {
+    ...         "generator": "grid",
+    ...         "parameters": {"n_x": 16, "n_y": 16, "pitch_um": 3.0},
+    ...     },
     ...     "sensor": {"preset": "machine_vision"},
     ...     "exposure_s": 0.002,
     ... }

@@ -92,7 +92,10 @@ class Integrator:
 
     >>> ramp = np.broadcast_to([0.5, 1.5, 2.5], (3, 3))
     >>> left = fs.Layout.from_rectangles([[0.75, 1.5]], 0.5)
-    >>> [float(fs.Integrator(left, integrator.grid, order=order)(ramp)[0]) for order in (1, 2)]
+    >>> [
+    ...     float(fs.Integrator(left, integrator.grid, order=order)(ramp)[0])
+    ...     for order in (1, 2)
+    ... ]
     [0.125, 0.1875]
     """
 

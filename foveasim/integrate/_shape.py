@@ -234,7 +234,9 @@ def vertex_gradient(
 
     >>> import foveasim as fs
     >>> square = fs.Layout.from_rectangles([[1.5, 1.5]], size_um=2.0)
-    >>> vertex_gradient(square, fs.Grid(shape=(3, 3), pitch_um=1.0), np.ones((3, 3)), [1.0])[2]
+    >>> vertex_gradient(
+    ...     square, fs.Grid(shape=(3, 3), pitch_um=1.0), np.ones((3, 3)), [1.0]
+    ... )[2]
     array([1., 1.])
     """
     if edges is None:

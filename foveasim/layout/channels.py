@@ -73,7 +73,9 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     Examples
     --------
     >>> from foveasim.layout import grid
-    >>> mosaic(grid(n_x=4, n_y=2, pitch_um=2.0), "BGGR").channel.reshape(2, 4)[::-1].tolist()
+    >>> mosaic(grid(n_x=4, n_y=2, pitch_um=2.0), "BGGR").channel.reshape(2, 4)[
+    ...     ::-1
+    ... ].tolist()
     [[2, 1, 2, 1], [1, 0, 1, 0]]
     """
     is_from_top = isinstance(block, str) and block not in MOSAICS
@@ -183,7 +185,9 @@ def random_channels(layout: Layout, fractions: ArrayLike, *, seed: int) -> Layou
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> layout = fs.layout.random_channels(fs.layout.grid(n_x=10, n_y=10, pitch_um=2.0), [0.5, 0.25, 0.25], seed=0)
+    >>> layout = fs.layout.random_channels(
+    ...     fs.layout.grid(n_x=10, n_y=10, pitch_um=2.0), [0.5, 0.25, 0.25], seed=0
+    ... )
     >>> np.bincount(layout.channel).tolist()
     [50, 25, 25]
     """
@@ -228,9 +232,13 @@ def graph_colouring(
     Examples
     --------
     >>> import foveasim as fs
-    >>> layout = fs.layout.graph_colouring(fs.layout.hexagonal(n_columns=6, n_rows=6, pitch_um=3.0), 3)
+    >>> layout = fs.layout.graph_colouring(
+    ...     fs.layout.hexagonal(n_columns=6, n_rows=6, pitch_um=3.0), 3
+    ... )
     >>> sites = layout.adjacency().tocoo()
-    >>> bool((layout.channel[sites.row] != layout.channel[sites.col]).all())  # no neighbours with the same filter
+    >>> bool(
+    ...     (layout.channel[sites.row] != layout.channel[sites.col]).all()
+    ... )  # no neighbours with the same filter
     True
     """
     from foveasim.layout import _kernels

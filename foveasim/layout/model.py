@@ -122,7 +122,9 @@ class Layout:
     --------
     >>> import foveasim as fs
     >>> import shapely
-    >>> layout = fs.Layout.from_polygons([shapely.box(0, 0, 2, 2), shapely.Point(5, 1).buffer(1.0)])
+    >>> layout = fs.Layout.from_polygons(
+    ...     [shapely.box(0, 0, 2, 2), shapely.Point(5, 1).buffer(1.0)]
+    ... )
     >>> layout.n_sites, layout.area_um2.round(2).tolist()
     (2, [4.0, 3.14])
     >>> layout[layout.area_um2 > 3.5].n_sites  # selections as of arrays
@@ -302,7 +304,9 @@ class Layout:
         Examples
         --------
         >>> import shapely
-        >>> layout = Layout.from_polygons([shapely.box(0, 0, 2, 2), shapely.Point(5, 0).buffer(1)], channel=[0, 1])
+        >>> layout = Layout.from_polygons(
+        ...     [shapely.box(0, 0, 2, 2), shapely.Point(5, 0).buffer(1)], channel=[0, 1]
+        ... )
         >>> layout.n_sites, float(layout.area_um2[0])
         (2, 4.0)
         >>> Layout.from_polygons([[(0, 0), (2, 0), (0, 2)], [(2, 2), (4, 0), (4, 2)]]).n_sites

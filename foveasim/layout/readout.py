@@ -47,7 +47,9 @@ def readout_by(layout: Layout, column: str | None = None, *, scan: Scan = "rows_
     Examples
     --------
     >>> import foveasim as fs
-    >>> layout = fs.layout.readout_by(fs.layout.grid(n_x=3, n_y=2, pitch_um=2.0))  # row 0 is the lowest
+    >>> layout = fs.layout.readout_by(
+    ...     fs.layout.grid(n_x=3, n_y=2, pitch_um=2.0)
+    ... )  # row 0 is the lowest
     >>> layout.readout_line.tolist(), layout.columns["readout_order"].tolist()
     ([0, 1, 2, 0, 1, 2], [1, 1, 1, 0, 0, 0])
     """

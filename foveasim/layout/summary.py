@@ -56,7 +56,9 @@ class Summary:
     Examples
     --------
     >>> import foveasim as fs
-    >>> summary = fs.layout.describe(fs.layout.grid(n_x=10, n_y=10, pitch_um=3.0, fill_factor=0.64))
+    >>> summary = fs.layout.describe(
+    ...     fs.layout.grid(n_x=10, n_y=10, pitch_um=3.0, fill_factor=0.64)
+    ... )
     >>> summary.n_sites, round(summary.area_um2, 1), summary.size_um.round(2).tolist()
     (100, 576.0, [2.4, 2.4, 2.4, 2.4, 2.4])
     """

@@ -89,7 +89,11 @@ class SensorLayer(nn.Module):
     --------
     >>> import foveasim as fs
     >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8)
-    >>> sensor = fs.Sensor(fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=8.0), bits=10, read_noise_e=2.0)
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=8.0),
+    ...     bits=10,
+    ...     read_noise_e=2.0,
+    ... )
     >>> layer = SensorLayer(fs.Camera(optics=lens, sensor=sensor), scene_shape=(3, 64, 64))
     >>> layer(torch.rand(5, 3, 64, 64)).shape
     torch.Size([5, 400])

@@ -84,7 +84,9 @@ def generated(generator: str | Callable[..., Layout], parameters: Mapping[str, A
     Zones whose sides are fixed multiples of the pitch:
 
     >>> points, outlines = generated(
-    ...     lambda pitch_um: fs.layout.zones(side_um=(4 * pitch_um, 8 * pitch_um), pitch_um=(pitch_um, 2 * pitch_um)),
+    ...     lambda pitch_um: fs.layout.zones(
+    ...         side_um=(4 * pitch_um, 8 * pitch_um), pitch_um=(pitch_um, 2 * pitch_um)
+    ...     ),
     ...     {"pitch_um": pitch_um},
     ... )
     >>> outlines

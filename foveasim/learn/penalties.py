@@ -100,7 +100,12 @@ def barrier(
     --------
     >>> import foveasim as fs
     >>> mesh = fs.learn.Mesh(fs.layout.grid(2, 2, 1.0))
-    >>> barrier(mesh(), mesh, fs.DesignRules(min_width_um=0.5, angle_limit_deg=60.0), convex=True).item()
+    >>> barrier(
+    ...     mesh(),
+    ...     mesh,
+    ...     fs.DesignRules(min_width_um=0.5, angle_limit_deg=60.0),
+    ...     convex=True,
+    ... ).item()
     0.0
     >>> round(barrier(mesh(), mesh, fs.DesignRules(min_size_um=0.98)).item(), 4)
     1.2239

@@ -102,7 +102,9 @@ def read_power_map(
     --------
     >>> import numpy as np
     >>> np.save("spot.npy", np.ones((20, 30)))  # doctest: +SKIP
-    >>> read_power_map("spot.npy", pitch_um=0.5, wavelength_nm=550.0, unit="w_m2").grid.bounds_um  # doctest: +SKIP
+    >>> read_power_map(
+    ...     "spot.npy", pitch_um=0.5, wavelength_nm=550.0, unit="w_m2"
+    ... ).grid.bounds_um  # doctest: +SKIP
     (-7.5, -5.0, 7.5, 5.0)
     """
     path = Path(path)

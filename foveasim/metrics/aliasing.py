@@ -237,7 +237,9 @@ def sampling_spectrum(
     Examples
     --------
     >>> import foveasim as fs
-    >>> spectrum = fs.metrics.sampling_spectrum(fs.layout.grid(n_x=32, n_y=32, pitch_um=5.0))
+    >>> spectrum = fs.metrics.sampling_spectrum(
+    ...     fs.layout.grid(n_x=32, n_y=32, pitch_um=5.0)
+    ... )
     >>> type(spectrum).__name__, spectrum.power.ndim
     ('SamplingSpectrum', 2)
     """
@@ -296,7 +298,9 @@ def aliasing_spectrum(
     Examples
     --------
     >>> import foveasim as fs
-    >>> layout = fs.layout.grid(n_x=32, n_y=32, pitch_um=5.0)  # Nyquist frequency 100 per mm
+    >>> layout = fs.layout.grid(
+    ...     n_x=32, n_y=32, pitch_um=5.0
+    ... )  # Nyquist frequency 100 per mm
     >>> found = fs.metrics.aliasing_spectrum(layout, (140.0, 0.0))
     >>> round(float(found.alias_per_mm.flat[0]))  # 140 - 200
     -60

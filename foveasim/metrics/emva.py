@@ -258,10 +258,20 @@ def emva1288(
     >>> import foveasim as fs
     >>> import numpy as np
     >>> layout = fs.layout.grid(n_x=40, n_y=40, pitch_um=3.0)
-    >>> sensor = fs.Sensor(layout, capacitance_f=1.6e-15, v_sat_v=1.0, bits=12, read_noise_e=5.0, pedestal_v=0.02)
+    >>> sensor = fs.Sensor(
+    ...     layout,
+    ...     capacitance_f=1.6e-15,
+    ...     v_sat_v=1.0,
+    ...     bits=12,
+    ...     read_noise_e=5.0,
+    ...     pedestal_v=0.02,
+    ... )
     >>> photons = np.linspace(2e3, 24e3, 12)
     >>> levels_e = 0.5 * photons * np.ones((1600, 1))  # quantum efficiency of 0.5
-    >>> frames = [fs.metrics.draw_frames(sensor, level_e, n_frames=2, seed=k) for k, level_e in enumerate(levels_e.T)]
+    >>> frames = [
+    ...     fs.metrics.draw_frames(sensor, level_e, n_frames=2, seed=k)
+    ...     for k, level_e in enumerate(levels_e.T)
+    ... ]
     >>> dark = [fs.metrics.draw_frames(sensor, np.zeros(1600), n_frames=2, seed=99)]
     >>> found = fs.metrics.emva1288(frames, dark, photons)
     >>> found.qe.round(2).tolist(), found.dark_noise_e.round().tolist()

@@ -269,10 +269,14 @@ def estimate_flow(
     >>> import numpy as np
     >>> grid = fs.Grid.centred((64, 64), 1.0)
     >>> y, x = np.mgrid[:64, :64]
-    >>> before, after = (100.0 + 20.0 * (np.sin(0.4 * (x - u)) + np.sin(0.4 * y)) for u in (0.0, 0.25))
+    >>> before, after = (
+    ...     100.0 + 20.0 * (np.sin(0.4 * (x - u)) + np.sin(0.4 * y)) for u in (0.0, 0.25)
+    ... )
     >>> layout = fs.layout.grid(n_x=16, n_y=16, pitch_um=3.0)
     >>> values_e = fs.Integrator(layout, grid)(after)
-    >>> fs.metrics.estimate_flow(layout, values_e, before, grid, variance_e2=900.0).flow_um.round(2).tolist()
+    >>> fs.metrics.estimate_flow(
+    ...     layout, values_e, before, grid, variance_e2=900.0
+    ... ).flow_um.round(2).tolist()
     [[0.25, 0.0]]
     """
     cells = _validate_map(map_e_per_um2, grid)

@@ -281,7 +281,9 @@ def draw_frames(
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> sensor = fs.Sensor(fs.layout.grid(50, 50, 3.0), capacitance_f=1.6e-15, v_sat_v=1.0, bits=12)
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(50, 50, 3.0), capacitance_f=1.6e-15, v_sat_v=1.0, bits=12
+    ... )
     >>> frames = fs.metrics.draw_frames(sensor, np.full(2500, 1000.0), n_frames=4, seed=0)
     >>> frames.shape
     (4, 2500)
@@ -335,7 +337,12 @@ def photon_transfer(
     --------
     >>> import numpy as np
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor(fs.layout.grid(n_x=200, n_y=200, pitch_um=2.0), bits=12, capacitance_f=1e-15, v_sat_v=1.0)
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(n_x=200, n_y=200, pitch_um=2.0),
+    ...     bits=12,
+    ...     capacitance_f=1e-15,
+    ...     v_sat_v=1.0,
+    ... )
     >>> curve = fs.metrics.photon_transfer(sensor, np.linspace(0.0, 6000.0, 13), seed=0)
     >>> bool(np.abs(curve.gain_dn_per_e() * 6241.5 / 4096 - 1.0) < 0.02)
     True
@@ -423,8 +430,12 @@ def predicted_photon_transfer(
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> sensor = fs.Sensor(fs.layout.grid(4, 4, 3.0), capacitance_f=1.6e-15, v_sat_v=1.0, bits=12)
-    >>> curve = fs.metrics.predicted_photon_transfer(sensor, [np.full(16, e) for e in (1000.0, 4000.0)])
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(4, 4, 3.0), capacitance_f=1.6e-15, v_sat_v=1.0, bits=12
+    ... )
+    >>> curve = fs.metrics.predicted_photon_transfer(
+    ...     sensor, [np.full(16, e) for e in (1000.0, 4000.0)]
+    ... )
     >>> slope = np.diff(curve.temporal_variance_dn2[:, 0]) / np.diff(curve.mean_dn[:, 0])
     >>> slope.round(4).tolist()  # DN per electron
     [0.4104]

@@ -81,7 +81,9 @@ def polygon_otf(layout: Layout, wave_per_mm: ArrayLike, *, n_threads: int | None
     Examples
     --------
     >>> from foveasim.layout import grid
-    >>> otf = polygon_otf(grid(n_x=1, n_y=1, pitch_um=2.0), [[0.0, 0.0], [250.0, 0.0], [250.0, 250.0]])
+    >>> otf = polygon_otf(
+    ...     grid(n_x=1, n_y=1, pitch_um=2.0), [[0.0, 0.0], [250.0, 0.0], [250.0, 250.0]]
+    ... )
     >>> np.round(otf.real, 4)
     array([[1.    , 0.6366, 0.4053]])
     """

@@ -50,7 +50,14 @@ def psnr_db(
 
     Examples
     --------
-    >>> float(round(psnr_db([[1.0, 2.0], [3.0, np.nan]], [[1.1, 2.1], [2.9, 7.0]], data_range=1.0), 6))
+    >>> float(
+    ...     round(
+    ...         psnr_db(
+    ...             [[1.0, 2.0], [3.0, np.nan]], [[1.1, 2.1], [2.9, 7.0]], data_range=1.0
+    ...         ),
+    ...         6,
+    ...     )
+    ... )
     20.0
     """
     image, ideal, is_compared = _prepare_comparison(picture, reference, min_coverage)
@@ -94,7 +101,10 @@ def ssim(
     >>> import foveasim as fs
     >>> import numpy as np
     >>> picture = np.random.default_rng(0).random((32, 32))
-    >>> round(fs.metrics.ssim(picture, picture), 6), round(fs.metrics.ssim(0.5 * picture + 0.25, picture), 3)
+    >>> (
+    ...     round(fs.metrics.ssim(picture, picture), 6),
+    ...     round(fs.metrics.ssim(0.5 * picture + 0.25, picture), 3),
+    ... )
     (1.0, 0.801)
     """
     image, ideal, is_compared = _prepare_comparison(picture, reference, min_coverage)

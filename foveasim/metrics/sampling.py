@@ -102,7 +102,9 @@ def neighbour_spacing_um(layout: Layout, *, per_channel: bool = False) -> tuple[
     Examples
     --------
     >>> import foveasim as fs
-    >>> nearest_um, row_um = fs.metrics.neighbour_spacing_um(fs.layout.hexagonal(n_columns=9, n_rows=9, pitch_um=4.0))
+    >>> nearest_um, row_um = fs.metrics.neighbour_spacing_um(
+    ...     fs.layout.hexagonal(n_columns=9, n_rows=9, pitch_um=4.0)
+    ... )
     >>> round(float(nearest_um[40]), 4), round(float(row_um[40]), 4)  # 4 and 4 · √3 / 2
     (4.0, 3.4641)
     """

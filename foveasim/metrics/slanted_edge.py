@@ -203,7 +203,9 @@ def slanted_edge_mtf(
     >>> import numpy as np
     >>> layout = fs.layout.grid(n_x=80, n_y=80, pitch_um=4.0)
     >>> x_um, y_um = layout.centroid_um.T
-    >>> edge = np.clip((x_um + 0.1 * y_um) / 4.0 + 0.5, 0.0, 1.0)  # through the apertures of the sites
+    >>> edge = np.clip(
+    ...     (x_um + 0.1 * y_um) / 4.0 + 0.5, 0.0, 1.0
+    ... )  # through the apertures of the sites
     >>> found = fs.metrics.slanted_edge_mtf(layout, edge)
     >>> round(found.angle_deg, 1), round(found.mtf50_per_mm)  # |sinc| is 0.5 at 151 per mm
     (5.7, 150)

@@ -208,10 +208,14 @@ def snr_by_class(
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
     >>> layout = fs.layout.grid(n_x=16, n_y=16, pitch_um=4.0)
     >>> sensor = fs.Sensor.from_preset(layout, "machine_vision")
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
     >>> table = fs.metrics.snr_by_class(camera, scene, exposure_s=0.005)
     >>> table.size_um.tolist(), bool(40.0 < table.snr[0] < 120.0)
     ([4.0], True)
@@ -267,10 +271,18 @@ def relative_exposure_at_snr_fraction(
     --------
     >>> import foveasim as fs
     >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0)
-    >>> sensor = fs.Sensor(layout, read_noise_e=5.0, capacitance_f=1.6e-15, v_sat_v=1.0, bits=12)
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=300.0, distance_m=1.0, illuminance_lux=500.0)
-    >>> fs.metrics.relative_exposure_at_snr_fraction(camera, scene, exposure_s=0.01, snr=10.0).round(4).tolist()
+    >>> sensor = fs.Sensor(
+    ...     layout, read_noise_e=5.0, capacitance_f=1.6e-15, v_sat_v=1.0, bits=12
+    ... )
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=300.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
+    >>> fs.metrics.relative_exposure_at_snr_fraction(
+    ...     camera, scene, exposure_s=0.01, snr=10.0
+    ... ).round(4).tolist()
     [0.0217]
     """
     exposure_s = EXPOSURE.check("exposure_s", exposure_s)
@@ -376,7 +388,9 @@ def measured_snr_by_class(
     >>> sensor = fs.Sensor(layout, capacitance_f=1.6e-15, v_sat_v=1.0, bits=12)
     >>> frames = fs.metrics.draw_frames(sensor, np.full(1600, 900.0), n_frames=8, seed=0)
     >>> dark = fs.metrics.draw_frames(sensor, np.zeros(1600), n_frames=8, seed=1)
-    >>> fs.metrics.measured_snr_by_class(layout, frames, dark, bits=12).snr.round(0).tolist()  # √900 of shot noise
+    >>> fs.metrics.measured_snr_by_class(layout, frames, dark, bits=12).snr.round(
+    ...     0
+    ... ).tolist()  # √900 of shot noise
     [30.0]
     """
     captures = frames if isinstance(frames, Sequence) and all(isinstance(frame, Capture) for frame in frames) else ()

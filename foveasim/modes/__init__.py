@@ -3,7 +3,9 @@ Acquisition modes other than global exposures: rolling shutters, events, spikes.
 
 ::
 
-    pixels = fs.modes.EventPixels(camera.sensor, contrast_on=0.2, contrast_off=0.2, refractory_s=1e-4)
+    pixels = fs.modes.EventPixels(
+        camera.sensor, contrast_on=0.2, contrast_off=0.2, refractory_s=1e-4
+    )
     for events in pixels.stream(camera.rates(frames), frame_s=1 / 1000, seed=0):
         ...
 """

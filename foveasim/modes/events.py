@@ -77,7 +77,12 @@ class Events:
     >>> import foveasim as fs
     >>> import numpy as np
     >>> layout, polarity = fs.layout.grid(2, 1, 3.0), np.array([1, -1], np.int8)
-    >>> events = fs.modes.Events(t_s=np.array([0.1, 0.2]), site=np.array([0, 1]), polarity=polarity, layout=layout)
+    >>> events = fs.modes.Events(
+    ...     t_s=np.array([0.1, 0.2]),
+    ...     site=np.array([0, 1]),
+    ...     polarity=polarity,
+    ...     layout=layout,
+    ... )
     >>> events.histogram([0.0, 0.15, 0.3]).tolist()
     [[1, 0], [0, 1]]
     """
@@ -472,11 +477,16 @@ def write_events(
     >>> import tempfile
     >>> from pathlib import Path
     >>> import foveasim as fs
-    >>> pixels = fs.modes.EventPixels(fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=10.0)), floor_e_per_s=0.0)
+    >>> pixels = fs.modes.EventPixels(
+    ...     fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=10.0)), floor_e_per_s=0.0
+    ... )
     >>> events = pixels.events([[100.0, 100.0], [1000.0, 100.0]], frame_s=1.0, seed=0)
     >>> with tempfile.TemporaryDirectory() as directory:
     ...     path = Path(directory, "events.h5")
-    ...     print(fs.modes.write_events([events], path), set(fs.modes.Events.load(path).site.tolist()))
+    ...     print(
+    ...         fs.modes.write_events([events], path),
+    ...         set(fs.modes.Events.load(path).site.tolist()),
+    ...     )
     11 {0}
     """
     target = Path(path)

@@ -304,7 +304,9 @@ class SpikingPixels(_Pixels):
     --------
     >>> import foveasim as fs
     >>> sensor = fs.Sensor(fs.layout.grid(n_x=1, n_y=1, pitch_um=10.0), shot_noise="off")
-    >>> SpikingPixels(sensor, threshold_e=400.0).events([[1000.0], [500.0]], frame_s=1.0, seed=0).t_s.round(9).tolist()
+    >>> SpikingPixels(sensor, threshold_e=400.0).events(
+    ...     [[1000.0], [500.0]], frame_s=1.0, seed=0
+    ... ).t_s.round(9).tolist()
     [0.4, 0.8, 1.4]
     """
 

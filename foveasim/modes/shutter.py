@@ -69,7 +69,9 @@ class Shutter:
     Two lines with an exposure of 2 s, frames of 1.5 s, and a line time of 0.5 s:
 
     >>> import foveasim as fs
-    >>> layout = fs.layout.grid(n_x=1, n_y=2, pitch_um=2.0).with_columns(readout_order=np.array([0, 1]))
+    >>> layout = fs.layout.grid(n_x=1, n_y=2, pitch_um=2.0).with_columns(
+    ...     readout_order=np.array([0, 1])
+    ... )
     >>> shutter = Shutter(layout, frame_s=1.5, line_s=0.5)
     >>> [shutter.overlap_fraction(frame, 2.0).tolist() for frame in range(3)]
     [[0.75, 0.5], [0.25, 0.5], [0.0, 0.0]]
@@ -178,8 +180,12 @@ class Exposure:
 
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> layout = fs.layout.grid(n_x=1, n_y=2, pitch_um=2.0).with_columns(readout_order=np.array([0, 1]))
-    >>> exposure = fs.modes.Exposure(fs.modes.Shutter(layout, frame_s=1.0, line_s=0.5), exposure_s=1.0)
+    >>> layout = fs.layout.grid(n_x=1, n_y=2, pitch_um=2.0).with_columns(
+    ...     readout_order=np.array([0, 1])
+    ... )
+    >>> exposure = fs.modes.Exposure(
+    ...     fs.modes.Shutter(layout, frame_s=1.0, line_s=0.5), exposure_s=1.0
+    ... )
     >>> for rate_e_per_s in (100.0, 200.0):
     ...     exposure.add(np.full(2, rate_e_per_s))
     >>> exposure.is_complete, exposure.mean_e_per_s(np.full(2, 200.0)).tolist()

@@ -45,7 +45,9 @@ class IlluminationTable:
     Examples
     --------
     >>> import foveasim as fs
-    >>> table = fs.optics.IlluminationTable(image_height_um=(0.0, 1000.0, 2000.0), fraction=(1.0, 0.9, 0.6))
+    >>> table = fs.optics.IlluminationTable(
+    ...     image_height_um=(0.0, 1000.0, 2000.0), fraction=(1.0, 0.9, 0.6)
+    ... )
     >>> table.at([[0.0, 0.0], [0.0, -1000.0], [3000.0, 0.0]]).round(6).tolist()
     [1.0, 0.9, 0.6]
     """

@@ -205,7 +205,10 @@ class Optics(PointImages):
     >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8)
     >>> round(lens.working_f_number(0.5), 4), round(lens.strehl(550.0), 6)
     (2.8455, 1.0)
-    >>> round(float(lens.mtf(100.0, 550.0)), 4), round(float(lens.encircled_energy(3.0, 550.0)), 4)
+    >>> (
+    ...     round(float(lens.mtf(100.0, 550.0)), 4),
+    ...     round(float(lens.encircled_energy(3.0, 550.0)), 4),
+    ... )
     (0.8047, 0.9035)
     """
 

@@ -333,7 +333,10 @@ class PointImages:
         >>> import foveasim as fs
         >>> coma = fs.optics.Seidel(coma_um=0.165, field_radius_um=100.0)  # 0.3 waves at 550 nm
         >>> lens = fs.Optics(focal_length_mm=8.0, f_number=4.0, seidel=coma)
-        >>> [round(lens.strehl(550.0, field_um=(100.0, 0.0), reference=at), 3) for at in ("peak", "image_point")]
+        >>> [
+        ...     round(lens.strehl(550.0, field_um=(100.0, 0.0), reference=at), 3)
+        ...     for at in ("peak", "image_point")
+        ... ]
         [0.952, 0.647]
         """
         check_choice("reference", reference, ("peak", "image_point"))

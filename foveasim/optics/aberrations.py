@@ -112,7 +112,10 @@ def zernike(n: int, m: int, x: ArrayLike, y: ArrayLike) -> Floats:
     Examples
     --------
     >>> import foveasim as fs
-    >>> round(float(fs.optics.zernike(2, 0, 0.0, 0.0)), 4), round(float(fs.optics.zernike(2, 0, 1.0, 0.0)), 4)
+    >>> (
+    ...     round(float(fs.optics.zernike(2, 0, 0.0, 0.0)), 4),
+    ...     round(float(fs.optics.zernike(2, 0, 1.0, 0.0)), 4),
+    ... )
     (-1.7321, 1.7321)
     """
     from scipy.special import eval_jacobi
@@ -156,7 +159,9 @@ class Zernike:
     A quarter wave of coma with the flare upwards, and defocus that depends on the wavelength:
 
     >>> coma = Zernike(coefficients={7: 0.25}, unit="waves", wavelength_nm=550.0)
-    >>> colour = Zernike(coefficients={4: [0.1, 0.0, 0.05]}, wavelength_nm=[450.0, 550.0, 650.0])
+    >>> colour = Zernike(
+    ...     coefficients={4: [0.1, 0.0, 0.05]}, wavelength_nm=[450.0, 550.0, 650.0]
+    ... )
     >>> coma.coefficients_um(550.0)
     {(3, -1): 0.1375}
     """
@@ -257,8 +262,13 @@ class Seidel(Declared):
     Examples
     --------
     >>> import foveasim as fs
-    >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8, seidel=fs.optics.Seidel(coma_um=0.1))
-    >>> [round(lens.strehl(550.0, field_um=(x_um, 0.0)), 3) for x_um in (0.0, 500.0, 1000.0)]
+    >>> lens = fs.Optics(
+    ...     focal_length_mm=8.0, f_number=2.8, seidel=fs.optics.Seidel(coma_um=0.1)
+    ... )
+    >>> [
+    ...     round(lens.strehl(550.0, field_um=(x_um, 0.0)), 3)
+    ...     for x_um in (0.0, 500.0, 1000.0)
+    ... ]
     [1.0, 0.995, 0.982]
     """
 
@@ -306,7 +316,9 @@ class LateralColour:
     Examples
     --------
     >>> import foveasim as fs
-    >>> colour = fs.optics.LateralColour(wavelength_nm=[450.0, 550.0, 650.0], magnification=[0.998, 1.0, 1.001])
+    >>> colour = fs.optics.LateralColour(
+    ...     wavelength_nm=[450.0, 550.0, 650.0], magnification=[0.998, 1.0, 1.001]
+    ... )
     >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8, lateral_colour=colour)
     >>> lens.lateral_colour.at([500.0, 700.0]).round(4).tolist()
     [0.999, 1.001]

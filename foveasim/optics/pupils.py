@@ -53,9 +53,13 @@ class Annulus(Declared):
     --------
     >>> import foveasim as fs
     >>> lens = fs.Optics(focal_length_mm=100.0, f_number=8.0, pupil=fs.optics.Annulus(0.5))
-    >>> lens.mtf([50.0, 150.0], 550.0).round(3).tolist()  # less contrast at low frequencies, more at high ones
+    >>> lens.mtf([50.0, 150.0], 550.0).round(
+    ...     3
+    ... ).tolist()  # less contrast at low frequencies, more at high ones
     [0.449, 0.232]
-    >>> fs.Optics(focal_length_mm=100.0, f_number=8.0).mtf([50.0, 150.0], 550.0).round(3).tolist()
+    >>> fs.Optics(focal_length_mm=100.0, f_number=8.0).mtf([50.0, 150.0], 550.0).round(
+    ...     3
+    ... ).tolist()
     [0.722, 0.225]
     """
 
@@ -88,7 +92,10 @@ class Spider(Declared):
     Examples
     --------
     >>> import foveasim as fs
-    >>> bool(fs.optics.Spider(4, 0.1)(0.5, 0.0, 550.0)), bool(fs.optics.Spider(4, 0.1)(0.4, 0.4, 550.0))
+    >>> (
+    ...     bool(fs.optics.Spider(4, 0.1)(0.5, 0.0, 550.0)),
+    ...     bool(fs.optics.Spider(4, 0.1)(0.4, 0.4, 550.0)),
+    ... )
     (False, True)
     """
 
@@ -129,7 +136,10 @@ class Blades(Declared):
     Examples
     --------
     >>> import foveasim as fs
-    >>> bool(fs.optics.Blades(6)(0.95, 0.0, 550.0)), bool(fs.optics.Blades(6)(0.0, 0.95, 550.0))  # a vertex, an edge
+    >>> (
+    ...     bool(fs.optics.Blades(6)(0.95, 0.0, 550.0)),
+    ...     bool(fs.optics.Blades(6)(0.0, 0.95, 550.0)),
+    ... )  # a vertex, an edge
     (True, False)
     """
 
@@ -169,7 +179,10 @@ class Slit(Declared):
     Examples
     --------
     >>> import foveasim as fs
-    >>> bool(fs.optics.Slit(0.2)(0.5, 0.05, 550.0)), bool(fs.optics.Slit(0.2)(0.5, 0.25, 550.0))
+    >>> (
+    ...     bool(fs.optics.Slit(0.2)(0.5, 0.05, 550.0)),
+    ...     bool(fs.optics.Slit(0.2)(0.5, 0.25, 550.0)),
+    ... )
     (True, False)
     """
 

@@ -91,7 +91,9 @@ def fill_channels(
     >>> import foveasim as fs
     >>> import numpy as np
     >>> layout = fs.layout.mosaic(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), ["RG", "GB"])
-    >>> fs.reconstruct.fill_channels(layout, np.array([1.0, 2.0, 3.0, 4.0]), layout.channel, 3).tolist()
+    >>> fs.reconstruct.fill_channels(
+    ...     layout, np.array([1.0, 2.0, 3.0, 4.0]), layout.channel, 3
+    ... ).tolist()
     [[1.0, 1.0, 1.0, 1.0], [2.5, 2.0, 3.0, 2.5], [4.0, 4.0, 4.0, 4.0]]
     """
     values = finite_array("values", values)

@@ -250,8 +250,12 @@ def to_cortical(
     --------
     >>> import foveasim as fs
     >>> layout = fs.layout.grid(n_x=40, n_y=40, pitch_um=2.0)
-    >>> picture = fs.reconstruct.cells(layout, layout.centroid_um[:, 0] ** 2, fs.Grid.centred((40, 40), 2.0))
-    >>> image = fs.reconstruct.to_cortical(picture, n_rings=8, n_sectors=32, r_min_um=4.0, r_max_um=36.0)
+    >>> picture = fs.reconstruct.cells(
+    ...     layout, layout.centroid_um[:, 0] ** 2, fs.Grid.centred((40, 40), 2.0)
+    ... )
+    >>> image = fs.reconstruct.to_cortical(
+    ...     picture, n_rings=8, n_sectors=32, r_min_um=4.0, r_max_um=36.0
+    ... )
     >>> image.data.shape
     (1, 8, 32)
     """
@@ -309,7 +313,9 @@ def from_cortical(image: CorticalImage, grid: Grid, *, method: Literal["linear",
     >>> import foveasim as fs
     >>> layout = fs.layout.log_polar(n_sectors=32, n_rings=8, r_min_um=10.0, r_max_um=60.0)
     >>> image = fs.reconstruct.cortical(layout, layout.columns["ring"])
-    >>> picture = fs.reconstruct.from_cortical(image, fs.Grid.centred((64, 64), 2.0), method="nearest")
+    >>> picture = fs.reconstruct.from_cortical(
+    ...     image, fs.Grid.centred((64, 64), 2.0), method="nearest"
+    ... )
     >>> picture.data[0, 32, 36:64:4].tolist()  # along the x axis, outwards
     [nan, 2.0, 4.0, 5.0, 6.0, 7.0, 7.0]
     """

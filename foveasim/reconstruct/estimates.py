@@ -40,8 +40,12 @@ class SiteEstimates:
     >>> import foveasim as fs
     >>> import numpy as np
     >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=3.0), full_well_e=5000.0)
-    >>> estimates = fs.reconstruct.estimate_from_charge([399, 2499], sensor, exposure_s=0.01)
-    >>> (estimates.light_e / np.sqrt(estimates.variance_e2)).round(1).tolist()  # signal-to-noise ratio
+    >>> estimates = fs.reconstruct.estimate_from_charge(
+    ...     [399, 2499], sensor, exposure_s=0.01
+    ... )
+    >>> (estimates.light_e / np.sqrt(estimates.variance_e2)).round(
+    ...     1
+    ... ).tolist()  # signal-to-noise ratio
     [20.0, 50.0]
     """
 
@@ -59,7 +63,9 @@ def electrons_per_code(sensor: Sensor) -> Floats:
     Examples
     --------
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor(fs.layout.grid(2, 1, 3.0), capacitance_f=1.6e-15, v_sat_v=1.0, bits=12)
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(2, 1, 3.0), capacitance_f=1.6e-15, v_sat_v=1.0, bits=12
+    ... )
     >>> fs.reconstruct.electrons_per_code(sensor).round(3).tolist()
     [2.438, 2.438]
     """
@@ -80,7 +86,11 @@ def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: Annota
     Examples
     --------
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=3.0), dark_e_per_s=100.0, full_well_e=5000.0)
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(n_x=2, n_y=1, pitch_um=3.0),
+    ...     dark_e_per_s=100.0,
+    ...     full_well_e=5000.0,
+    ... )
     >>> estimates = fs.reconstruct.estimate_from_charge([410, 5000], sensor, exposure_s=0.1)
     >>> estimates.light_e.tolist(), estimates.is_saturated.tolist()
     ([400.0, 4990.0], [False, True])
@@ -109,7 +119,12 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: Annotated[fl
     Examples
     --------
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=3.0), capacitance_f=1.602176634e-15, v_sat_v=1.0, bits=10)
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(n_x=2, n_y=1, pitch_um=3.0),
+    ...     capacitance_f=1.602176634e-15,
+    ...     v_sat_v=1.0,
+    ...     bits=10,
+    ... )
     >>> estimates = fs.reconstruct.estimate_from_code([512, 1023], sensor, exposure_s=0.01)
     >>> estimates.light_e.round().tolist(), estimates.is_saturated.tolist()
     ([5005.0, 9995.0], [False, True])

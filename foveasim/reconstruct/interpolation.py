@@ -62,7 +62,9 @@ def linear(
     >>> import foveasim as fs
     >>> layout = fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0)
     >>> grid = fs.Grid.centred((4, 4), 1.0)
-    >>> picture = fs.reconstruct.linear(layout, layout.centroid_um[:, 0], grid)  # a ramp remains one
+    >>> picture = fs.reconstruct.linear(
+    ...     layout, layout.centroid_um[:, 0], grid
+    ... )  # a ramp remains one
     >>> picture.data[0, 1].round(3).tolist()
     [-1.5, -0.5, 0.5, 1.5]
     """

@@ -117,10 +117,15 @@ def least_squares(
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> layout, grid = fs.layout.grid(n_x=8, n_y=8, pitch_um=4.0), fs.Grid.centred((16, 16), 2.0)
+    >>> layout, grid = (
+    ...     fs.layout.grid(n_x=8, n_y=8, pitch_um=4.0),
+    ...     fs.Grid.centred((16, 16), 2.0),
+    ... )
     >>> expected_e = 50.0 * layout.area_um2  # a uniform image of 50 e-/µm²
     >>> charge_e = np.random.default_rng(0).poisson(expected_e)
-    >>> picture = fs.reconstruct.least_squares(layout, charge_e, grid, variance=expected_e, mu=10.0)
+    >>> picture = fs.reconstruct.least_squares(
+    ...     layout, charge_e, grid, variance=expected_e, mu=10.0
+    ... )
     >>> round(float(picture.data.mean()), 1), round(float(picture.data.std()), 2)
     (50.4, 0.07)
     """

@@ -87,7 +87,10 @@ class Picture:
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> layout, grid = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0), fs.Grid.centred((8, 8), 1.0)
+    >>> layout, grid = (
+    ...     fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0),
+    ...     fs.Grid.centred((8, 8), 1.0),
+    ... )
     >>> picture = fs.reconstruct.cells(layout, np.arange(16.0), grid)
     >>> picture.data.shape, picture.grid.bounds_um
     ((1, 8, 8), (-4.0, -4.0, 4.0, 4.0))

@@ -47,7 +47,9 @@ def reference(power_map: PowerMap, grid: Grid, *, weights: Floats | None = None)
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> power_map = fs.PowerMap.from_array(np.array([[1.0, 3.0], [5.0, 7.0]]), pitch_um=2.0, wavelength_nm=550.0)
+    >>> power_map = fs.PowerMap.from_array(
+    ...     np.array([[1.0, 3.0], [5.0, 7.0]]), pitch_um=2.0, wavelength_nm=550.0
+    ... )
     >>> fs.reconstruct.reference(power_map, fs.Grid.centred((1, 1), 4.0)).data.tolist()
     [[[4.0]]]
     """
@@ -118,7 +120,9 @@ def blur_kernel(
     --------
     >>> import foveasim as fs
     >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8)
-    >>> kernel = fs.reconstruct.blur_kernel(lens, fs.Grid.centred((32, 32), 1.0), wavelength_nm=550.0)
+    >>> kernel = fs.reconstruct.blur_kernel(
+    ...     lens, fs.Grid.centred((32, 32), 1.0), wavelength_nm=550.0
+    ... )
     >>> kernel.shape, round(float(kernel[kernel.shape[0] // 2, kernel.shape[1] // 2]), 3)
     ((31, 31), 0.245)
     """

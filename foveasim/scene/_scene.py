@@ -153,7 +153,9 @@ class Scene:
     >>> import foveasim as fs
     >>> import numpy as np
     >>> picture = np.tile(np.linspace(0.0, 1.0, 64), (48, 1))
-    >>> scene = fs.Scene.from_picture(picture, pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> scene = fs.Scene.from_picture(
+    ...     picture, pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
     >>> scene.basis.shape, round(float(scene.luminance_cd_m2.max()), 1)  # 500 / π
     ((1, 48, 64), 159.2)
     """

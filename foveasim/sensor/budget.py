@@ -38,9 +38,13 @@ class NoiseBudget(dict[str, Floats]):
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> sensor = fs.Sensor(fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), read_noise_e=5.0, prnu_fraction=0.01)
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), read_noise_e=5.0, prnu_fraction=0.01
+    ... )
     >>> budget = fs.sensor.noise_budget(sensor, np.full(64, 1e5), 0.01)
-    >>> [name for name in budget if name not in budget.temporal and budget[name].any()]  # fixed patterns
+    >>> [
+    ...     name for name in budget if name not in budget.temporal and budget[name].any()
+    ... ]  # fixed patterns
     ['prnu']
     """
 
@@ -120,9 +124,18 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: Annotated[fl
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> sensor = fs.Sensor(fs.layout.grid(8, 8, 3.0), read_noise_e=5.0, capacitance_f=1.6e-15, v_sat_v=1.0, bits=12)
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(8, 8, 3.0),
+    ...     read_noise_e=5.0,
+    ...     capacitance_f=1.6e-15,
+    ...     v_sat_v=1.0,
+    ...     bits=12,
+    ... )
     >>> budget = fs.sensor.noise_budget(sensor, np.full(64, 1e5), 0.01)
-    >>> round(float(budget["photon_shot"].mean()), 2), round(float(budget["read"].mean()), 2)
+    >>> (
+    ...     round(float(budget["photon_shot"].mean()), 2),
+    ...     round(float(budget["read"].mean()), 2),
+    ... )
     (31.62, 5.0)
     """
     rates = check_per_site(

@@ -117,11 +117,18 @@ class Calibration:
     >>> import foveasim as fs
     >>> import numpy as np
     >>> layout = fs.layout.grid(n_x=16, n_y=16, pitch_um=2.0)
-    >>> sensor = fs.Sensor(layout, prnu_fraction=0.05, capacitance_f=2e-15, bits=12, shot_noise="off")
-    >>> calibration = fs.sensor.calibrate(sensor, exposure_s=0.1, flat_e=8000.0, n_frames=4, seed=1)
+    >>> sensor = fs.Sensor(
+    ...     layout, prnu_fraction=0.05, capacitance_f=2e-15, bits=12, shot_noise="off"
+    ... )
+    >>> calibration = fs.sensor.calibrate(
+    ...     sensor, exposure_s=0.1, flat_e=8000.0, n_frames=4, seed=1
+    ... )
     >>> code = sensor.read(sensor.collect(sensor.response * 6000.0, seed=2), seed=2)
     >>> corrected_dn = calibration.correct(code)
-    >>> round(float(code.std() / code.mean()), 3), round(float(corrected_dn.std() / corrected_dn.mean()), 3)
+    >>> (
+    ...     round(float(code.std() / code.mean()), 3),
+    ...     round(float(corrected_dn.std() / corrected_dn.mean()), 3),
+    ... )
     (0.052, 0.001)
     """
 
@@ -408,10 +415,17 @@ def calibrate(
     --------
     >>> import foveasim as fs
     >>> sensor = fs.Sensor(
-    ...     fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0), prnu_fraction=0.05, dark_e_per_s=2e4, bits=12, capacitance_f=2e-15
+    ...     fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0),
+    ...     prnu_fraction=0.05,
+    ...     dark_e_per_s=2e4,
+    ...     bits=12,
+    ...     capacitance_f=2e-15,
     ... )
     >>> calibration = calibrate(sensor, exposure_s=0.1, flat_e=15000.0, n_frames=50, seed=1)
-    >>> bool(np.abs(calibration.gain * sensor.response.mean() / sensor.response - 1.0).max() < 0.01)
+    >>> bool(
+    ...     np.abs(calibration.gain * sensor.response.mean() / sensor.response - 1.0).max()
+    ...     < 0.01
+    ... )
     True
     """
     n_sites = sensor.layout.n_sites

@@ -58,7 +58,12 @@ class Rates:
     Examples
     --------
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor(fs.layout.grid(n_x=1, n_y=1, pitch_um=2.0), bits=10, v_sat_v=1.0, capacitance_f=1.6406288e-16)
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(n_x=1, n_y=1, pitch_um=2.0),
+    ...     bits=10,
+    ...     v_sat_v=1.0,
+    ...     capacitance_f=1.6406288e-16,
+    ... )
     >>> rates = fs.sensor.merge_exposures([[500], [1023]], [0.1, 10.0], sensor)
     >>> rates.rate_e_per_s.round().tolist(), rates.n_used.tolist()
     ([5005.0], [1])
@@ -157,16 +162,34 @@ def merge_exposures(
     A site with 5000 e-/s in two exposures, of which the second is saturated at 1000 e-:
 
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor(fs.layout.grid(n_x=1, n_y=1, pitch_um=2.0), bits=10, v_sat_v=1.0, capacitance_f=1.6406288e-16)
-    >>> merge_exposures([[499.5], [1023]], [0.1, 10.0], sensor).rate_e_per_s.round(1).tolist()
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(n_x=1, n_y=1, pitch_um=2.0),
+    ...     bits=10,
+    ...     v_sat_v=1.0,
+    ...     capacitance_f=1.6406288e-16,
+    ... )
+    >>> merge_exposures([[499.5], [1023]], [0.1, 10.0], sensor).rate_e_per_s.round(
+    ...     1
+    ... ).tolist()
     [5000.0]
 
     Adjacent large and small sites (sub-pixel HDR) are two classes of sites, here with sensitivities 1 and 0.1:
 
-    >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), bits=10, v_sat_v=1.0, capacitance_f=1.6406288e-16)
-    >>> rates, sensitivity = merge_exposures([[1023, 499.5]], [0.1], sensor), np.array([1.0, 0.1])
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0),
+    ...     bits=10,
+    ...     v_sat_v=1.0,
+    ...     capacitance_f=1.6406288e-16,
+    ... )
+    >>> rates, sensitivity = (
+    ...     merge_exposures([[1023, 499.5]], [0.1], sensor),
+    ...     np.array([1.0, 0.1]),
+    ... )
     >>> weight = (sensitivity / rates.sigma_e_per_s) ** 2
-    >>> round(float(np.nansum(weight * rates.rate_e_per_s / sensitivity) / np.nansum(weight)), 1)
+    >>> round(
+    ...     float(np.nansum(weight * rates.rate_e_per_s / sensitivity) / np.nansum(weight)),
+    ...     1,
+    ... )
     50000.0
     """
     times_s = DURATION.check_array("exposures_s", exposures_s, ndim=1)
@@ -263,8 +286,12 @@ def non_destructive_reads(
     Examples
     --------
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), shot_noise="off", full_well_e=500.0)
-    >>> non_destructive_reads(sensor, [100.0, 300.0], [1.0, 2.0, 3.0], seed=0).electrons.tolist()
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), shot_noise="off", full_well_e=500.0
+    ... )
+    >>> non_destructive_reads(
+    ...     sensor, [100.0, 300.0], [1.0, 2.0, 3.0], seed=0
+    ... ).electrons.tolist()
     [[100, 300], [200, 500], [300, 500]]
     """
     times, streams, collection = _check_increasing("times_s", times_s), Streams(seed, frame), sensor.collection
@@ -347,7 +374,9 @@ def fit_ramp(
     --------
     >>> import foveasim as fs
     >>> layout = fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0)
-    >>> sensor = fs.Sensor(layout, capacitance_f=1.6e-15, v_sat_v=1.0, bits=14, shot_noise="off")
+    >>> sensor = fs.Sensor(
+    ...     layout, capacitance_f=1.6e-15, v_sat_v=1.0, bits=14, shot_noise="off"
+    ... )
     >>> times_s = [1.0, 2.0, 3.0, 4.0]
     >>> ramp = fs.sensor.non_destructive_reads(sensor, [100.0, 1000.0], times_s, seed=0)
     >>> fs.sensor.fit_ramp(ramp.code, times_s, sensor).rate_e_per_s.round().tolist()

@@ -189,7 +189,9 @@ class Sensor:
     --------
     >>> import foveasim as fs
     >>> layout = fs.layout.mosaic(fs.layout.grid(n_x=64, n_y=64, pitch_um=3.0), "RGGB")
-    >>> sensor = fs.Sensor(layout, filters="rgb", qe=0.6, read_noise_e=2.0, full_well_e=1e4, bits=12)
+    >>> sensor = fs.Sensor(
+    ...     layout, filters="rgb", qe=0.6, read_noise_e=2.0, full_well_e=1e4, bits=12
+    ... )
     >>> [effect.name for effect in sensor.chain]
     ['shot', 'read']
     """
@@ -330,8 +332,13 @@ class Sensor:
         Examples
         --------
         >>> import foveasim as fs
-        >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=4, n_y=3, pitch_um=3.45), "machine_vision")
-        >>> sensor.bits, round(float(sensor.capacitance_f[0] / 1.602176634e-19))  # full well capacity at 1 V
+        >>> sensor = fs.Sensor.from_preset(
+        ...     fs.layout.grid(n_x=4, n_y=3, pitch_um=3.45), "machine_vision"
+        ... )
+        >>> (
+        ...     sensor.bits,
+        ...     round(float(sensor.capacitance_f[0] / 1.602176634e-19)),
+        ... )  # full well capacity at 1 V
         (12, 10700)
         """
         ideal = cls(layout)  # checks the layout
@@ -808,7 +815,9 @@ class Sensor:
 
         >>> import numpy as np
         >>> from foveasim.layout import grid
-        >>> sensor = Sensor(grid(n_x=4, n_y=4, pitch_um=2.0), full_well_e=1e4, capacitance_f=6e-16)
+        >>> sensor = Sensor(
+        ...     grid(n_x=4, n_y=4, pitch_um=2.0), full_well_e=1e4, capacitance_f=6e-16
+        ... )
         >>> round(sensor.exposure_for(np.full(16, 1e6)), 5)
         0.007
         """

@@ -115,7 +115,9 @@ def signal_to_noise(
 
     >>> import foveasim as fs
     >>> layout = fs.layout.grid(n_x=1, n_y=1, pitch_um=2.0)
-    >>> sensor = fs.Sensor(layout, bits=8, v_sat_v=1.0, capacitance_f=25_600 * 1.602176634e-19)
+    >>> sensor = fs.Sensor(
+    ...     layout, bits=8, v_sat_v=1.0, capacitance_f=25_600 * 1.602176634e-19
+    ... )
     >>> signal_to_noise(sensor, [400.0], [0.0]).ratio.round(2).tolist()
     [11.39]
     """

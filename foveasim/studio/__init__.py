@@ -88,7 +88,9 @@ def run_studio(
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.studio.run_studio("shot.yaml", changes=["sensor.bits=10"], out="saved")  # doctest: +SKIP
+    >>> fs.studio.run_studio(
+    ...     "shot.yaml", changes=["sensor.bits=10"], out="saved"
+    ... )  # doctest: +SKIP
     """
     for module in MODULES:
         import_optional("studio", module)

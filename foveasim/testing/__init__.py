@@ -114,7 +114,9 @@ def check_extension(kind: str, name: str) -> None:
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.testing.check_extension("layout generator", "hexagonal")  # AssertionError for a violated property
+    >>> fs.testing.check_extension(
+    ...     "layout generator", "hexagonal"
+    ... )  # AssertionError for a violated property
     """
     check = _check_of(kind)
     item, example = check.registry.find("name", name), check.registry.example(name)

@@ -77,7 +77,9 @@ def check_sensor_effect(name: str, keywords: Mapping[str, Any]) -> None:
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.testing.check_sensor_effect("read", {"read_noise_e": 3.0})  # AssertionError for a difference
+    >>> fs.testing.check_sensor_effect(
+    ...     "read", {"read_noise_e": 3.0}
+    ... )  # AssertionError for a difference
     """
     sensor = _sensor(keywords)
     names = [found.name for found in sensor.chain]

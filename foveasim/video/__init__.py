@@ -3,8 +3,12 @@ Videos: scenes from pictures and gaze paths; recordings of captures and video fi
 
 ::
 
-    frames = fs.video.FrameSource("street.mp4", pitch_um=20.0, distance_m=0.8, peak_radiance_w_m2_sr_nm=0.1)
-    fs.video.write_video(camera.video(frames, exposure_s=1 / 100, seed=0), "street.zarr", progress=True)
+    frames = fs.video.FrameSource(
+        "street.mp4", pitch_um=20.0, distance_m=0.8, peak_radiance_w_m2_sr_nm=0.1
+    )
+    fs.video.write_video(
+        camera.video(frames, exposure_s=1 / 100, seed=0), "street.zarr", progress=True
+    )
 """
 
 from __future__ import annotations

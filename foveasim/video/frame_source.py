@@ -84,7 +84,12 @@ class FrameSource:
     >>> import numpy as np
     >>> pictures = [np.full((4, 6), level) for level in (0.25, 0.5)]
     >>> footage = FrameSource(
-    ...     pictures, pitch_um=10.0, distance_m=1.0, peak_radiance_w_m2_sr_nm=0.1, band_width_nm=10.0, encoding="linear"
+    ...     pictures,
+    ...     pitch_um=10.0,
+    ...     distance_m=1.0,
+    ...     peak_radiance_w_m2_sr_nm=0.1,
+    ...     band_width_nm=10.0,
+    ...     encoding="linear",
     ... )
     >>> [float(scene.basis.max()) for scene in footage]
     [0.25, 0.5]

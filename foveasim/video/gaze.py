@@ -59,7 +59,9 @@ class GazePath:
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> path = fs.video.GazePath(np.array([0.0, 1.0]), np.array([[0.0, 0.0], [100.0, 50.0]]))
+    >>> path = fs.video.GazePath(
+    ...     np.array([0.0, 1.0]), np.array([[0.0, 0.0], [100.0, 50.0]])
+    ... )
     >>> path.at([0.25]).tolist()
     [[25.0, 12.5]]
     """
@@ -281,7 +283,9 @@ def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Sce
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> scene = fs.Scene.flat(shape=(8, 8), pitch_um=100.0, distance_m=1.0, illuminance_lux=100.0)
+    >>> scene = fs.Scene.flat(
+    ...     shape=(8, 8), pitch_um=100.0, distance_m=1.0, illuminance_lux=100.0
+    ... )
     >>> path = fs.video.GazePath(np.array([0.0, 0.1]), np.array([[0.0, 0.0], [5.0, 0.0]]))
     >>> [gaze_um for _, gaze_um in fs.video.shift_sensor(scene, path)]
     [(0.0, 0.0), (5.0, 0.0)]
@@ -329,7 +333,11 @@ def follow_gaze(
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> frames = [fs.Scene.flat(shape=(8, 8), pitch_um=100.0, distance_m=1.0, illuminance_lux=100.0)] * 3
+    >>> frames = [
+    ...     fs.Scene.flat(
+    ...         shape=(8, 8), pitch_um=100.0, distance_m=1.0, illuminance_lux=100.0
+    ...     )
+    ... ] * 3
     >>> path = fs.video.GazePath(np.array([0.0, 0.1]), np.array([[0.0, 0.0], [10.0, 0.0]]))
     >>> [gaze_um for _, gaze_um in fs.video.follow_gaze(frames, path, frame_s=0.05)]
     [(0.0, 0.0), (5.0, 0.0), (10.0, 0.0)]
@@ -390,10 +398,15 @@ def pan_camera(
     >>> import foveasim as fs
     >>> import numpy as np
     >>> optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
-    >>> scene = fs.Scene.flat(shape=(200, 200), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> scene = fs.Scene.flat(
+    ...     shape=(200, 200), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
     >>> path = fs.video.GazePath(np.array([0.0, 0.1]), np.array([[0.0, 0.0], [10.0, 0.0]]))
     >>> frames = list(fs.video.pan_camera(scene, path, optics, shape=(64, 64)))
-    >>> frames[1][0].basis.shape, round(frames[1][1][0], 2)  # 10 µm are 2 pixels of 4.03 µm, and 1.94 µm
+    >>> (
+    ...     frames[1][0].basis.shape,
+    ...     round(frames[1][1][0], 2),
+    ... )  # 10 µm are 2 pixels of 4.03 µm, and 1.94 µm
     ((1, 64, 64), 1.94)
     """
     n_y, n_x = check_shape("shape", shape)

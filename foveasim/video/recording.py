@@ -128,13 +128,24 @@ def read_recording(path: str | Path) -> Recording:
     >>> import tempfile
     >>> from pathlib import Path
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), "machine_vision")
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=300.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> sensor = fs.Sensor.from_preset(
+    ...     fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), "machine_vision"
+    ... )
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=300.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
     >>> with tempfile.TemporaryDirectory() as directory:
     ...     path = Path(directory, "wall.zarr")
-    ...     _ = fs.video.write_video(camera.video([scene] * 3, exposure_s=0.001, seed=0), path)
-    ...     print(fs.video.read_recording(path).code.shape, fs.video.read_recording(path).frame.tolist())
+    ...     _ = fs.video.write_video(
+    ...         camera.video([scene] * 3, exposure_s=0.001, seed=0), path
+    ...     )
+    ...     print(
+    ...         fs.video.read_recording(path).code.shape,
+    ...         fs.video.read_recording(path).frame.tolist(),
+    ...     )
     (3, 64) [0, 1, 2]
     """
     source = Path(path)

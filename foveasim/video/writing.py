@@ -141,9 +141,15 @@ def write_video(
     >>> import tempfile
     >>> from pathlib import Path
     >>> import foveasim as fs
-    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), "machine_vision")
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=300.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> sensor = fs.Sensor.from_preset(
+    ...     fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), "machine_vision"
+    ... )
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=300.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
     >>> captures = camera.video([scene] * 3, exposure_s=0.001, seed=0)
     >>> with tempfile.TemporaryDirectory() as directory:
     ...     print(fs.video.write_video(captures, Path(directory, "wall.gif"), frame_s=0.1))
@@ -152,7 +158,9 @@ def write_video(
     The same lines start a recording, resume it after an interruption, and do nothing when it is finished::
 
         n = count_recorded_frames("long.zarr")
-        captures = camera.video(footage.from_frame(n), exposure_s=0.01, seed=0, first_frame=n)
+        captures = camera.video(
+            footage.from_frame(n), exposure_s=0.01, seed=0, first_frame=n
+        )
         write_video(captures, "long.zarr", resume=True)
 
     With a moving gaze, the first frames are skipped::

@@ -76,7 +76,9 @@ def id_map(
     Examples
     --------
     >>> from foveasim.layout import grid
-    >>> id_map(grid(n_x=2, n_y=1, pitch_um=3.0), (1, 4), (-4.0, -1.0, 4.0, 1.0)).tolist()  # centres at -3, -1, 1, 3
+    >>> id_map(
+    ...     grid(n_x=2, n_y=1, pitch_um=3.0), (1, 4), (-4.0, -1.0, 4.0, 1.0)
+    ... ).tolist()  # centres at -3, -1, 1, 3
     [[0, 0, 1, -1]]
     """
     n_y, n_x = check_shape("shape", shape)
@@ -120,7 +122,9 @@ class SitePixels:
     Examples
     --------
     >>> import foveasim as fs
-    >>> pixels = fs.view.SitePixels.from_layout(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), (20, 20))
+    >>> pixels = fs.view.SitePixels.from_layout(
+    ...     fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), (20, 20)
+    ... )
     >>> pixels.site_at([-1.0, 1.0], [-1.0, 1.0]).tolist()
     [0, 3]
     """

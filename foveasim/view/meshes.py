@@ -79,7 +79,9 @@ class Mesh:
     Examples
     --------
     >>> import foveasim as fs
-    >>> columns = fs.view.prisms(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), [1.0, 3.0], max_height_um=6.0)
+    >>> columns = fs.view.prisms(
+    ...     fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), [1.0, 3.0], max_height_um=6.0
+    ... )
     >>> columns.points_um.max(axis=0).tolist(), sorted(set(columns.photosite.tolist()))
     ([2.0, 1.0, 6.0], [0, 1])
     """

@@ -106,7 +106,13 @@ class Viewpoint:
     >>> import foveasim as fs
     >>> from_above = fs.view.Viewpoint(azimuth_deg=-90.0, elevation_deg=90.0)
     >>> layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0)
-    >>> fs.view.render(layout, viewpoint=from_above, size_px=(120, 120), renderer="software", legend=False).shape
+    >>> fs.view.render(
+    ...     layout,
+    ...     viewpoint=from_above,
+    ...     size_px=(120, 120),
+    ...     renderer="software",
+    ...     legend=False,
+    ... ).shape
     (120, 120, 3)
     """
 
@@ -202,7 +208,9 @@ def render(
     --------
     >>> import foveasim as fs
     >>> layout = fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0)
-    >>> picture = fs.view.render(layout, size_px=(160, 100), renderer="software", legend=False)
+    >>> picture = fs.view.render(
+    ...     layout, size_px=(160, 100), renderer="software", legend=False
+    ... )
     >>> picture.shape, picture[0, 0].tolist()  # the background
     ((100, 160, 3), [238, 240, 244])
     """
@@ -265,7 +273,9 @@ def sites_in_view(
     >>> import foveasim as fs
     >>> import numpy as np
     >>> layout = fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0)
-    >>> site = fs.view.sites_in_view(layout, viewpoint=fs.view.Viewpoint(elevation_deg=90.0), size_px=(160, 100))
+    >>> site = fs.view.sites_in_view(
+    ...     layout, viewpoint=fs.view.Viewpoint(elevation_deg=90.0), size_px=(160, 100)
+    ... )
     >>> np.unique(site).size - 1  # all sites from above, and the background
     16
     """
@@ -310,7 +320,9 @@ def plotter(
     Examples
     --------
     >>> import foveasim as fs
-    >>> plotter = fs.view.plotter(fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), off_screen=True)  # doctest: +SKIP
+    >>> plotter = fs.view.plotter(
+    ...     fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), off_screen=True
+    ... )  # doctest: +SKIP
     >>> plotter.add_text("16 photosites")  # doctest: +SKIP
     >>> plotter.screenshot("columns.png")  # doctest: +SKIP
     """
@@ -396,7 +408,9 @@ def show_columns(
     Examples
     --------
     >>> import foveasim as fs
-    >>> layout = fs.layout.log_polar(n_sectors=64, n_rings=16, r_min_um=20.0, r_max_um=100.0)
+    >>> layout = fs.layout.log_polar(
+    ...     n_sectors=64, n_rings=16, r_min_um=20.0, r_max_um=100.0
+    ... )
     >>> fs.view.show_columns(layout, "size_um", max_height_um=20.0)  # doctest: +SKIP
     """
     show(prisms(data, height, by=by, max_height_um=max_height_um), viewpoint=viewpoint, size_px=size_px)

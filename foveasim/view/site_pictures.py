@@ -215,7 +215,9 @@ def picture_colours(
     --------
     >>> import numpy as np
     >>> from foveasim.layout import grid
-    >>> picture_colours(grid(n_x=2, n_y=1, pitch_um=1.0), np.array([[[9, 8, 7], [255, 0, 0]]], np.uint8)).tolist()
+    >>> picture_colours(
+    ...     grid(n_x=2, n_y=1, pitch_um=1.0), np.array([[[9, 8, 7], [255, 0, 0]]], np.uint8)
+    ... ).tolist()
     [[9, 8, 7], [255, 0, 0]]
     """
     pixels = np.asarray(unmasked("picture", picture))

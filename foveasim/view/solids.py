@@ -93,7 +93,10 @@ class SensorStack(Declared):
     Examples
     --------
     >>> import foveasim as fs
-    >>> solids = fs.view.solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), fs.view.SensorStack(well_depth_um=2.0))
+    >>> solids = fs.view.solids(
+    ...     fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0),
+    ...     fs.view.SensorStack(well_depth_um=2.0),
+    ... )
     >>> [mesh.name for mesh in solids.meshes]
     ['wells', 'trenches', 'filters', 'lenses']
     """
@@ -182,7 +185,10 @@ class Solids:
     Examples
     --------
     >>> import foveasim as fs
-    >>> model = fs.view.solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=4.0), fs.view.SensorStack(trench_width_um=0.4))
+    >>> model = fs.view.solids(
+    ...     fs.layout.grid(n_x=2, n_y=2, pitch_um=4.0),
+    ...     fs.view.SensorStack(trench_width_um=0.4),
+    ... )
     >>> list(model.parts), round(model.fill_factor, 2)
     (['wells', 'trenches', 'filters', 'lenses'], 0.81)
     """
@@ -376,7 +382,10 @@ def solids(
     Examples
     --------
     >>> from foveasim.layout import grid
-    >>> model = solids(grid(n_x=2, n_y=2, pitch_um=4.0), SensorStack(well_depth_um=3.0, trench_width_um=0.4))
+    >>> model = solids(
+    ...     grid(n_x=2, n_y=2, pitch_um=4.0),
+    ...     SensorStack(well_depth_um=3.0, trench_width_um=0.4),
+    ... )
     >>> round(model.fill_factor, 9)  # (3.6 / 4)²
     0.81
     """
@@ -453,8 +462,12 @@ def stack(
     --------
     >>> import foveasim as fs
     >>> layout = fs.layout.mosaic(fs.layout.grid(n_x=6, n_y=6, pitch_um=3.0), ["RG", "GB"])
-    >>> model = fs.view.stack(layout, fs.view.SensorStack(well_depth_um=3.0, trench_width_um=0.3))
-    >>> {mesh.name: len(set(mesh.photosite.tolist())) for mesh in model.meshes}  # photosites that remain in each part
+    >>> model = fs.view.stack(
+    ...     layout, fs.view.SensorStack(well_depth_um=3.0, trench_width_um=0.3)
+    ... )
+    >>> {
+    ...     mesh.name: len(set(mesh.photosite.tolist())) for mesh in model.meshes
+    ... }  # photosites that remain in each part
     {'wells': 30, 'trenches': 30, 'filters': 27, 'lenses': 20}
     """
     model = solids(data, sensor_stack, by=by)
@@ -497,7 +510,9 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
     >>> columns = fs.view.prisms(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), [1.0, 3.0])
     >>> with tempfile.TemporaryDirectory() as directory:
     ...     fs.view.write_meshes([columns], Path(directory, "columns.stl"))
-    ...     print(Path(directory, "columns.stl").stat().st_size)  # 84 bytes, and 50 per triangle
+    ...     print(
+    ...         Path(directory, "columns.stl").stat().st_size
+    ...     )  # 84 bytes, and 50 per triangle
     1084
     """
     import trimesh

@@ -151,15 +151,29 @@ class Dataset:
     >>> import numpy as np
     >>> shot = {
     ...     "scene": {
-    ...         "kind": "picture", "picture": "", "fit": "cover", "distance_m": 1.0,
-    ...         "peak_radiance_w_m2_sr_nm": 0.1, "wavelength_nm": 550, "band_width_nm": 100,
+    ...         "kind": "picture",
+    ...         "picture": "",
+    ...         "fit": "cover",
+    ...         "distance_m": 1.0,
+    ...         "peak_radiance_w_m2_sr_nm": 0.1,
+    ...         "wavelength_nm": 550,
+    ...         "band_width_nm": 100,
     ...     },
     ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
-    ...     "layout": {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 8.0}},
+    ...     "layout": {
+    ...         "generator": "grid",
+    ...         "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 8.0},
+    ...     },
     ...     "exposure_s": 0.01,
     ... }
     >>> pictures = np.full((3, 32, 32), 128, np.uint8)
-    >>> data = Dataset(pictures, shot, {"optics.f_number": {"uniform": [2.0, 4.0]}}, cameras=2, labels=[0, 1, 0])
+    >>> data = Dataset(
+    ...     pictures,
+    ...     shot,
+    ...     {"optics.f_number": {"uniform": [2.0, 4.0]}},
+    ...     cameras=2,
+    ...     labels=[0, 1, 0],
+    ... )
     >>> len(data), data[3]["code"].shape, data[3]["label"]
     (6, (64,), 1)
     """

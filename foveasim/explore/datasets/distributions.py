@@ -125,7 +125,9 @@ def parse_distribution(path: str, spec: Any) -> Distribution:
     --------
     >>> parse_distribution("sensor.bits", {"choice": [8, 10]}).bounds
     (8, 10)
-    >>> 1.4 <= parse_distribution("optics.f_number", {"log_uniform": [1.4, 8.0]}).sample(seed=0, camera=3)[0] <= 8.0
+    >>> 1.4 <= parse_distribution("optics.f_number", {"log_uniform": [1.4, 8.0]}).sample(
+    ...     seed=0, camera=3
+    ... )[0] <= 8.0
     True
     """
     known = "; ".join(f"{kind}: {form}" for kind, form in FORMS.items())

@@ -46,7 +46,9 @@ def torch_dataset(dataset: Samples, transform: Callable[[dict[str, Any]], Any] |
     --------
     ::
 
-        loader = torch.utils.data.DataLoader(torch_dataset(dataset), batch_size=32, shuffle=True, num_workers=4)
+        loader = torch.utils.data.DataLoader(
+            torch_dataset(dataset), batch_size=32, shuffle=True, num_workers=4
+        )
     """
     return _dataset_class()(dataset, transform)
 

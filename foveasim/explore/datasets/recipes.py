@@ -56,11 +56,24 @@ def classification(
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> scene = {"kind": "picture", "picture": "", "fit": "cover", "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "picture",
+    ...     "picture": "",
+    ...     "fit": "cover",
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 8.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.01}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.01,
+    ... }
     >>> pictures = np.full((2, 32, 32), 128, np.uint8)
-    >>> dataset = fs.explore.classification(pictures, shot, cameras=3, labels=["cat", "dog"])
+    >>> dataset = fs.explore.classification(
+    ...     pictures, shot, cameras=3, labels=["cat", "dog"]
+    ... )
     >>> len(dataset), dataset.class_names, dataset[5]["code"].shape
     (6, ['cat', 'dog'], (64,))
     """
@@ -118,9 +131,20 @@ def denoising(
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> scene = {"kind": "picture", "picture": "", "fit": "cover", "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "picture",
+    ...     "picture": "",
+    ...     "fit": "cover",
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 8.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.01}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.01,
+    ... }
     >>> dataset = fs.explore.denoising(np.full((2, 32, 32), 128, np.uint8), shot, draws=4)
     >>> len(dataset), sorted(key for key in dataset[0] if key in ("code", "expected_dn"))
     (8, ['code', 'expected_dn'])

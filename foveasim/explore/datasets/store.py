@@ -117,9 +117,20 @@ def write_dataset(
     >>> from pathlib import Path
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> scene = {"kind": "picture", "picture": "", "fit": "cover", "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "picture",
+    ...     "picture": "",
+    ...     "fit": "cover",
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 8.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.01}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.01,
+    ... }
     >>> dataset = fs.explore.denoising(np.full((2, 32, 32), 128, np.uint8), shot)
     >>> with tempfile.TemporaryDirectory() as directory:
     ...     stored = fs.explore.write_dataset(dataset, Path(directory, "noisy"))
@@ -328,9 +339,20 @@ def open_dataset(path: str | Path) -> StoredSamples:
     >>> from pathlib import Path
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> scene = {"kind": "picture", "picture": "", "fit": "cover", "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "picture",
+    ...     "picture": "",
+    ...     "fit": "cover",
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 8.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.01}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.01,
+    ... }
     >>> dataset = fs.explore.denoising(np.full((2, 32, 32), 128, np.uint8), shot)
     >>> with tempfile.TemporaryDirectory() as directory:
     ...     _ = fs.explore.write_dataset(dataset, Path(directory, "noisy.zarr"))

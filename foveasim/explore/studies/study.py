@@ -114,11 +114,24 @@ def study(
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "flat",
+    ...     "shape": [60, 60],
+    ...     "pitch_um": 300.0,
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.002}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.002,
+    ... }
     >>> shot["sensor"] = {"preset": "machine_vision"}
-    >>> found = fs.explore.study(shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=4)
+    >>> found = fs.explore.study(
+    ...     shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=4
+    ... )
     >>> found.best_params
     {'optics.f_number': 2.0}
     """
@@ -171,11 +184,24 @@ def run_study(
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "flat",
+    ...     "shape": [60, 60],
+    ...     "pitch_um": 300.0,
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.002}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.002,
+    ... }
     >>> shot["sensor"] = {"preset": "machine_vision"}
-    >>> plan = fs.explore.plan_study(shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=4)
+    >>> plan = fs.explore.plan_study(
+    ...     shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=4
+    ... )
     >>> fs.explore.run_study(plan).best_params
     {'optics.f_number': 2.0}
     """
@@ -230,11 +256,24 @@ def best_table(plan: StudyPlan, optuna_study: optuna.Study) -> Table:
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "flat",
+    ...     "shape": [60, 60],
+    ...     "pitch_um": 300.0,
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.002}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.002,
+    ... }
     >>> shot["sensor"] = {"preset": "machine_vision"}
-    >>> plan = fs.explore.plan_study(shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=1)
+    >>> plan = fs.explore.plan_study(
+    ...     shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=1
+    ... )
     >>> table = fs.explore.best_table(plan, fs.explore.run_study(plan))
     >>> table.row_count
     1

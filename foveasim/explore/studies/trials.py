@@ -32,11 +32,24 @@ def finished_trials(optuna_study: optuna.Study) -> list[optuna.trial.FrozenTrial
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "flat",
+    ...     "shape": [60, 60],
+    ...     "pitch_um": 300.0,
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.002}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.002,
+    ... }
     >>> shot["sensor"] = {"preset": "machine_vision"}
-    >>> found = fs.explore.study(shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=3)
+    >>> found = fs.explore.study(
+    ...     shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=3
+    ... )
     >>> [trial.number for trial in fs.explore.finished_trials(found)]
     [0, 1, 2]
     """
@@ -88,11 +101,24 @@ def trials_table(optuna_study: optuna.Study) -> pd.DataFrame:
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "flat",
+    ...     "shape": [60, 60],
+    ...     "pitch_um": 300.0,
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.002}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.002,
+    ... }
     >>> shot["sensor"] = {"preset": "machine_vision"}
-    >>> found = fs.explore.study(shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=4)
+    >>> found = fs.explore.study(
+    ...     shot, {"optics.f_number": [2.0, 8.0]}, {"snr_mean": "maximize"}, n_trials=4
+    ... )
     >>> table = fs.explore.trials_table(found)
     >>> set(table[table.is_best]["optics.f_number"])
     {2.0}

@@ -410,7 +410,9 @@ def plan_sweep(
     --------
     >>> import foveasim as fs
     >>> shot = fs.config.demo_settings()[0]
-    >>> plan = fs.explore.plan_sweep(shot, {"sensor.bits": [8, 10], "optics.f_number": [2.0, 2.8, 4.0]}, repeats=5)
+    >>> plan = fs.explore.plan_sweep(
+    ...     shot, {"sensor.bits": [8, 10], "optics.f_number": [2.0, 2.8, 4.0]}, repeats=5
+    ... )
     >>> plan.n_points, list(plan.metrics)
     (30, ['mean_code_dn', 'saturated_fraction', 'snr', 'n_sites'])
     """

@@ -247,13 +247,26 @@ def open_results(path: str | Path) -> xr.Dataset:
     >>> import tempfile
     >>> from pathlib import Path
     >>> import foveasim as fs
-    >>> scene = {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "flat",
+    ...     "shape": [60, 60],
+    ...     "pitch_um": 300.0,
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.002}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.002,
+    ... }
     >>> shot["sensor"] = {"preset": "machine_vision"}
     >>> with tempfile.TemporaryDirectory() as directory:
     ...     path = Path(directory, "results.zarr")
-    ...     _ = fs.explore.sweep(shot, {"sensor.bits": [8, 10]}, metrics=["n_sites"], out=path, workers=0)
+    ...     _ = fs.explore.sweep(
+    ...         shot, {"sensor.bits": [8, 10]}, metrics=["n_sites"], out=path, workers=0
+    ...     )
     ...     print(fs.explore.open_results(path)["n_sites"].values.tolist())
     [64, 64]
     """

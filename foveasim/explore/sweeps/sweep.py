@@ -78,17 +78,35 @@ def sweep(
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "flat",
+    ...     "shape": [60, 60],
+    ...     "pitch_um": 300.0,
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.002}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.002,
+    ... }
     >>> shot["sensor"] = {"preset": "machine_vision"}
-    >>> results = fs.explore.sweep(shot, {"optics.f_number": [2.8, 4.0], "sensor.bits": [8, 10]}, workers=0)
+    >>> results = fs.explore.sweep(
+    ...     shot, {"optics.f_number": [2.8, 4.0], "sensor.bits": [8, 10]}, workers=0
+    ... )
     >>> results["snr_mean"].sel({"sensor.bits": 10}).values.round().tolist()
     [33.0, 23.0]
 
     ::
 
-        results = sweep("shot.yaml", {"sensor.bits": [8, 10, 12], "exposure_s": [0.01, 0.02]}, repeats=10, out="results.zarr")
+        results = sweep(
+            "shot.yaml",
+            {"sensor.bits": [8, 10, 12], "exposure_s": [0.01, 0.02]},
+            repeats=10,
+            out="results.zarr",
+        )
         results["snr_mean"].mean("repeat")
     """
     plan = plan_sweep(shot, vary, mode=mode, repeats=repeats, seed=seed, metrics=metrics, changes=changes)
@@ -148,11 +166,24 @@ def run_sweep(
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = {"kind": "flat", "shape": [60, 60], "pitch_um": 300.0, "distance_m": 1.0, "illuminance_lux": 500.0}
+    >>> scene = {
+    ...     "kind": "flat",
+    ...     "shape": [60, 60],
+    ...     "pitch_um": 300.0,
+    ...     "distance_m": 1.0,
+    ...     "illuminance_lux": 500.0,
+    ... }
     >>> layout = {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}}
-    >>> shot = {"scene": scene, "optics": {"focal_length_mm": 8.0, "f_number": 2.8}, "layout": layout, "exposure_s": 0.002}
+    >>> shot = {
+    ...     "scene": scene,
+    ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    ...     "layout": layout,
+    ...     "exposure_s": 0.002,
+    ... }
     >>> shot["sensor"] = {"preset": "machine_vision"}
-    >>> plan = fs.explore.plan_sweep(shot, {"optics.f_number": [2.0, 2.8, 4.0]}, metrics=["snr"])
+    >>> plan = fs.explore.plan_sweep(
+    ...     shot, {"optics.f_number": [2.0, 2.8, 4.0]}, metrics=["snr"]
+    ... )
     >>> results = fs.explore.run_sweep(plan, workers=0)  # in this process
     >>> results["snr_mean"].round().values.tolist()
     [46.0, 33.0, 24.0]

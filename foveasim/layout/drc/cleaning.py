@@ -139,8 +139,12 @@ def cleaned(layout: Layout, *, tolerance_um: Annotated[float, LENGTH]) -> Layout
     Examples
     --------
     >>> import foveasim as fs
-    >>> layout = fs.Layout.from_rectangles([[0.0, 0.0], [3.997, 0.0]], 4.0)  # an overlap of 3 nm
-    >>> fs.layout.cleaned(layout, tolerance_um=0.005).check(fs.DesignRules(max_overlap_um2=0.0)).ok
+    >>> layout = fs.Layout.from_rectangles(
+    ...     [[0.0, 0.0], [3.997, 0.0]], 4.0
+    ... )  # an overlap of 3 nm
+    >>> fs.layout.cleaned(layout, tolerance_um=0.005).check(
+    ...     fs.DesignRules(max_overlap_um2=0.0)
+    ... ).ok
     True
     """
     return clean(layout, tolerance_um)[0]

@@ -767,7 +767,9 @@ def min_width_um(layout: Layout, *, angle_limit_deg: float = 90.0, dbu_um: float
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.layout.min_width_um(fs.Layout.from_rectangles([[0.0, 0.0]], [[3.0, 1.5]])).tolist()
+    >>> fs.layout.min_width_um(
+    ...     fs.Layout.from_rectangles([[0.0, 0.0]], [[3.0, 1.5]])
+    ... ).tolist()
     [1.5]
     """
     from foveasim.layout.drc.rules import DesignRules

@@ -243,7 +243,9 @@ def repair(layout: Layout, *, rules: DesignRules | None = None, method: Repair =
     Examples
     --------
     >>> import foveasim as fs
-    >>> layout = fs.Layout.from_rectangles([[0.0, 0.0], [5.0, 0.0]], [[3.0, 3.0], [3.0, 0.5]])
+    >>> layout = fs.Layout.from_rectangles(
+    ...     [[0.0, 0.0], [5.0, 0.0]], [[3.0, 3.0], [3.0, 0.5]]
+    ... )
     >>> fs.layout.repair(layout, rules=fs.DesignRules(min_width_um=1.0)).n_sites
     1
     """

@@ -143,7 +143,9 @@ def track_demand(layout: Layout, routing: Routing) -> TrackDemand:
 
     >>> import foveasim as fs
     >>> layout = fs.layout.readout_by(fs.layout.grid(n_x=10, n_y=4, pitch_um=3.0), "column")
-    >>> demand = fs.layout.track_demand(layout, fs.layout.Routing(width_um=0.5, space_um=0.5, direction="upwards"))
+    >>> demand = fs.layout.track_demand(
+    ...     layout, fs.layout.Routing(width_um=0.5, space_um=0.5, direction="upwards")
+    ... )
     >>> demand.n_nets.tolist(), demand.n_tracks.tolist()
     ([10], [30])
     """

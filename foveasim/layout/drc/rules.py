@@ -225,7 +225,9 @@ class Violation:
     Examples
     --------
     >>> import foveasim as fs
-    >>> report = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0).check(fs.DesignRules(min_size_um=2.5))
+    >>> report = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0).check(
+    ...     fs.DesignRules(min_size_um=2.5)
+    ... )
     >>> violation = report.violations[0]
     >>> violation.rule, violation.value, violation.limit, violation.unit
     ('min_size_um', 2.0, 2.5, 'µm')

@@ -54,7 +54,10 @@ def union(layouts: Iterable[Layout]) -> Layout:
     Examples
     --------
     >>> import foveasim as fs
-    >>> left, right = (fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0).translate(x_um, 0.0) for x_um in (-5.0, 5.0))
+    >>> left, right = (
+    ...     fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0).translate(x_um, 0.0)
+    ...     for x_um in (-5.0, 5.0)
+    ... )
     >>> fs.layout.union([left, right]).n_sites
     8
     """
@@ -146,7 +149,9 @@ def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
     Examples
     --------
     >>> import foveasim as fs
-    >>> layout = fs.layout.inset(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), 0.1)  # a trench of 0.2 µm
+    >>> layout = fs.layout.inset(
+    ...     fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), 0.1
+    ... )  # a trench of 0.2 µm
     >>> layout.area_um2.round(4).tolist()
     [3.24, 3.24]
     """
@@ -251,7 +256,9 @@ def merge_small(layout: Layout, *, min_size_um: Annotated[float, LENGTH]) -> Lay
     Examples
     --------
     >>> import foveasim as fs
-    >>> layout = fs.layout.split_at(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), [(1.0, 0.0)], n_x=4)
+    >>> layout = fs.layout.split_at(
+    ...     fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), [(1.0, 0.0)], n_x=4
+    ... )
     >>> fs.layout.merge_small(layout, min_size_um=1.2).area_um2.tolist()
     [5.0, 3.0]
     """
@@ -350,8 +357,12 @@ def node(layout: Layout) -> Layout:
     Examples
     --------
     >>> import foveasim as fs
-    >>> layout = fs.Layout.from_rectangles([[0.0, 0.0], [3.0, 0.0]], [[4.0, 4.0], [2.0, 2.0]])
-    >>> fs.layout.node(layout).xy_um.shape[0]  # the corners of the small square are vertices of the large one, too
+    >>> layout = fs.Layout.from_rectangles(
+    ...     [[0.0, 0.0], [3.0, 0.0]], [[4.0, 4.0], [2.0, 2.0]]
+    ... )
+    >>> fs.layout.node(layout).xy_um.shape[
+    ...     0
+    ... ]  # the corners of the small square are vertices of the large one, too
     10
     """
     xy_um, ring_offsets, _ = insert_points(layout.xy_um, layout.ring_offsets, np.unique(layout.xy_um, axis=0))
@@ -385,7 +396,9 @@ def snap(layout: Layout, grid_um: Annotated[float, LENGTH]) -> Layout:
     Examples
     --------
     >>> import foveasim as fs
-    >>> layout = fs.layout.snap(fs.layout.hexagonal(n_columns=1, n_rows=1, pitch_um=3.0), 0.005)
+    >>> layout = fs.layout.snap(
+    ...     fs.layout.hexagonal(n_columns=1, n_rows=1, pitch_um=3.0), 0.005
+    ... )
     >>> layout.xy_um[:2].tolist()
     [[1.5, -0.865], [1.5, 0.865]]
     """

@@ -59,7 +59,9 @@ def sites_at(layout: Layout, points_um: ArrayLike) -> Ints:
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.layout.sites_at(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), [(0.0, 0.0), (2.0, 2.0)]).tolist()
+    >>> fs.layout.sites_at(
+    ...     fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), [(0.0, 0.0), (2.0, 2.0)]
+    ... ).tolist()
     [4, 8]
     """
     points_um = _points("points_um", points_um)
@@ -93,7 +95,9 @@ def remove_at(layout: Layout, points_um: ArrayLike) -> Layout:
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.layout.remove_at(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), [(0.0, 0.0)]).n_sites
+    >>> fs.layout.remove_at(
+    ...     fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), [(0.0, 0.0)]
+    ... ).n_sites
     8
     """
     sites = np.unique(sites_at(layout, points_um))
@@ -170,7 +174,9 @@ def split_at(
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.layout.split_at(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), [(1.0, 0.0)], n_x=2, n_y=2).n_sites
+    >>> fs.layout.split_at(
+    ...     fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), [(1.0, 0.0)], n_x=2, n_y=2
+    ... ).n_sites
     5
     """
     sites = np.unique(sites_at(layout, points_um))

@@ -58,7 +58,9 @@ def draw(
     >>> import foveasim as fs
     >>> import shapely
     >>> layout = fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0)
-    >>> drawn = fs.layout.draw(layout, [shapely.box(-1.5, -1.5, 1.5, 1.5)])  # the others lose what it covers
+    >>> drawn = fs.layout.draw(
+    ...     layout, [shapely.box(-1.5, -1.5, 1.5, 1.5)]
+    ... )  # the others lose what it covers
     >>> drawn.n_sites, float(drawn.area_um2.sum())
     (9, 36.0)
     """

@@ -253,7 +253,9 @@ def write_layout(
     Examples
     --------
     >>> from foveasim.layout import grid
-    >>> written = write_layout(grid(n_x=3, n_y=3, pitch_um=2.0), "die.gds")  # doctest: +SKIP
+    >>> written = write_layout(
+    ...     grid(n_x=3, n_y=3, pitch_um=2.0), "die.gds"
+    ... )  # doctest: +SKIP
     >>> written.max_displacement_um  # doctest: +SKIP
     0.0
     """

@@ -104,7 +104,9 @@ def octagonal(
 
     Examples
     --------
-    >>> octagonal(n_x=4, n_y=3, pitch_um=5.0, diamond_um=3.0).area_um2[[0, -1]].round(9).tolist()
+    >>> octagonal(n_x=4, n_y=3, pitch_um=5.0, diamond_um=3.0).area_um2[[0, -1]].round(
+    ...     9
+    ... ).tolist()
     [16.0, 9.0]
     """
     n_x, n_y, pitch_um = cells_in_field(n_x, n_y, pitch_um, size_um)

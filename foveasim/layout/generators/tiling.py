@@ -114,7 +114,11 @@ def tiling(
     Examples
     --------
     >>> layout = tiling(pitch_um=4.0, radius_um=50.0)
-    >>> layout.n_sites, round(float(layout.area_um2.sum()), 1), round(float(layout.area_um2.min()), 1)
+    >>> (
+    ...     layout.n_sites,
+    ...     round(float(layout.area_um2.sum()), 1),
+    ...     round(float(layout.area_um2.min()), 1),
+    ... )
     (571, 7853.9, 7.0)
     """
     outline = parse_region(size_um=size_um, radius_um=radius_um, region=region)

@@ -142,7 +142,11 @@ def voronoi(
 
     Examples
     --------
-    >>> layout = voronoi(n_sites=200, size_um=(60.0, 40.0), density=lambda xy_um: 1.0 / (1.0 + (xy_um**2).sum(axis=1)))
+    >>> layout = voronoi(
+    ...     n_sites=200,
+    ...     size_um=(60.0, 40.0),
+    ...     density=lambda xy_um: 1.0 / (1.0 + (xy_um**2).sum(axis=1)),
+    ... )
     >>> layout.n_sites, round(float(layout.area_um2.sum()), 6)
     (200, 2400.0)
     """

@@ -53,7 +53,11 @@ class Cortical(nn.Module):
     --------
     >>> import foveasim as fs
     >>> import torch
-    >>> raster = Cortical(fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=4.0), n_rings=12, n_sectors=32)
+    >>> raster = Cortical(
+    ...     fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=4.0),
+    ...     n_rings=12,
+    ...     n_sectors=32,
+    ... )
     >>> raster(torch.rand(5, 3, 400)).shape
     torch.Size([5, 3, 12, 32])
     """

@@ -78,7 +78,9 @@ def read_psfs(
     >>> from tempfile import TemporaryDirectory
     >>> lens = fs.Optics(focal_length_mm=8.0, f_number=8.0)
     >>> h = lens.psf(550.0, pitch_um=2.0, n_points=65).psf_per_um2
-    >>> psfs = fs.optics.PSFGrid.from_arrays(h, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=2.0)
+    >>> psfs = fs.optics.PSFGrid.from_arrays(
+    ...     h, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=2.0
+    ... )
     >>> with TemporaryDirectory() as folder:
     ...     psfs.write(Path(folder) / "lens.npz")
     ...     fs.optics.read_psfs(Path(folder) / "lens.npz")

@@ -88,7 +88,9 @@ class PSFGrid:
     >>> import foveasim as fs
     >>> import numpy as np
     >>> spot = np.exp(-0.5 * np.add.outer(np.arange(-8, 9) ** 2, np.arange(-8, 9) ** 2))
-    >>> psfs = fs.optics.PSFGrid.from_arrays(spot, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0)
+    >>> psfs = fs.optics.PSFGrid.from_arrays(
+    ...     spot, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0
+    ... )
     >>> psfs
     PSFGrid(1 point, 550 nm, 17 x 17 samples of 1 µm)
     >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.8, psfs=psfs)
@@ -206,9 +208,16 @@ class PSFGrid:
         --------
         >>> import foveasim as fs
         >>> import numpy as np
-        >>> airy = fs.Optics(focal_length_mm=8.0, f_number=4.0).psf(550.0, pitch_um=1.0, n_points=64)
+        >>> airy = fs.Optics(focal_length_mm=8.0, f_number=4.0).psf(
+        ...     550.0, pitch_um=1.0, n_points=64
+        ... )
         >>> psfs = fs.optics.PSFGrid.from_arrays(
-        ...     airy.psf_per_um2, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0, centre=(31.5, 31.5)
+        ...     airy.psf_per_um2,
+        ...     x_um=0.0,
+        ...     y_um=0.0,
+        ...     wavelength_nm=550.0,
+        ...     pitch_um=1.0,
+        ...     centre=(31.5, 31.5),
         ... )
         >>> psfs.psf.shape, psfs.centre, bool(np.abs(psfs.centroid_um).max() < 1e-9)
         ((1, 1, 65, 65), (31.5, 31.5), True)

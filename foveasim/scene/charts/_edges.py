@@ -103,7 +103,12 @@ def checkerboard(
     --------
     >>> import foveasim as fs
     >>> scene = fs.scene.charts.checkerboard(
-    ...     square_mm=4.0, n_squares=(4, 6), shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ...     square_mm=4.0,
+    ...     n_squares=(4, 6),
+    ...     shape=(90, 120),
+    ...     pitch_um=400.0,
+    ...     distance_m=0.5,
+    ...     illuminance_lux=500.0,
     ... )
     >>> scene.basis.shape
     (1, 90, 120)
@@ -158,7 +163,11 @@ def slanted_edge(
     --------
     >>> import foveasim as fs
     >>> scene = fs.scene.charts.slanted_edge(
-    ...     angle_deg=5.0, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ...     angle_deg=5.0,
+    ...     shape=(90, 120),
+    ...     pitch_um=400.0,
+    ...     distance_m=0.5,
+    ...     illuminance_lux=500.0,
     ... )
     >>> round(float(scene.basis.min() / scene.basis.max()), 4)  # a ratio of 4
     0.25
@@ -214,7 +223,11 @@ def bars(
     --------
     >>> import foveasim as fs
     >>> scene = fs.scene.charts.bars(
-    ...     groups=[-1], shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ...     groups=[-1],
+    ...     shape=(90, 120),
+    ...     pitch_um=400.0,
+    ...     distance_m=0.5,
+    ...     illuminance_lux=500.0,
     ... )
     >>> scene.basis.shape
     (1, 90, 120)
@@ -336,7 +349,11 @@ def letter_f(
     --------
     >>> import foveasim as fs
     >>> scene = fs.scene.charts.letter_f(
-    ...     height_mm=20.0, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ...     height_mm=20.0,
+    ...     shape=(90, 120),
+    ...     pitch_um=400.0,
+    ...     distance_m=0.5,
+    ...     illuminance_lux=500.0,
     ... )
     >>> sorted(set(scene.basis.ravel().tolist()))
     [0.0, 1.0]

@@ -70,7 +70,11 @@ def grey_scale(
     --------
     >>> import foveasim as fs
     >>> scene = fs.scene.charts.grey_scale(
-    ...     patch_mm=3.0, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ...     patch_mm=3.0,
+    ...     shape=(90, 120),
+    ...     pitch_um=400.0,
+    ...     distance_m=0.5,
+    ...     illuminance_lux=500.0,
     ... )
     >>> scene.basis.shape
     (1, 90, 120)
@@ -154,7 +158,12 @@ def colour_chart(
     --------
     >>> import foveasim as fs
     >>> scene = fs.scene.charts.colour_chart(
-    ...     patch_mm=5.0, gap_mm=1.0, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ...     patch_mm=5.0,
+    ...     gap_mm=1.0,
+    ...     shape=(90, 120),
+    ...     pitch_um=400.0,
+    ...     distance_m=0.5,
+    ...     illuminance_lux=500.0,
     ... )
     >>> scene.basis.shape, scene.wavelength_nm.size
     ((12, 90, 120), 31)

@@ -65,7 +65,11 @@ def point_grid(
     --------
     >>> import foveasim as fs
     >>> scene = fs.scene.charts.point_grid(
-    ...     spacing_mm=4.0, intensity_w_sr_nm=1e-6, shape=(90, 120), pitch_um=400.0, distance_m=0.5
+    ...     spacing_mm=4.0,
+    ...     intensity_w_sr_nm=1e-6,
+    ...     shape=(90, 120),
+    ...     pitch_um=400.0,
+    ...     distance_m=0.5,
     ... )
     >>> int((scene.basis > 0.0).sum())
     99

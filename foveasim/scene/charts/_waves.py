@@ -60,7 +60,11 @@ def sine(
     --------
     >>> import foveasim as fs
     >>> scene = fs.scene.charts.sine(
-    ...     line_pairs_per_mm=0.2, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ...     line_pairs_per_mm=0.2,
+    ...     shape=(90, 120),
+    ...     pitch_um=400.0,
+    ...     distance_m=0.5,
+    ...     illuminance_lux=500.0,
     ... )
     >>> scene.basis.shape
     (1, 90, 120)
@@ -121,7 +125,11 @@ def zone_plate(
     --------
     >>> import foveasim as fs
     >>> scene = fs.scene.charts.zone_plate(
-    ...     line_pairs_per_mm=1.0, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ...     line_pairs_per_mm=1.0,
+    ...     shape=(90, 120),
+    ...     pitch_um=400.0,
+    ...     distance_m=0.5,
+    ...     illuminance_lux=500.0,
     ... )
     >>> scene.basis.shape
     (1, 90, 120)
@@ -194,7 +202,11 @@ def siemens_star(
     --------
     >>> import foveasim as fs
     >>> scene = fs.scene.charts.siemens_star(
-    ...     n_spokes=36, shape=(90, 120), pitch_um=400.0, distance_m=0.5, illuminance_lux=500.0
+    ...     n_spokes=36,
+    ...     shape=(90, 120),
+    ...     pitch_um=400.0,
+    ...     distance_m=0.5,
+    ...     illuminance_lux=500.0,
     ... )
     >>> scene.basis.shape
     (1, 90, 120)

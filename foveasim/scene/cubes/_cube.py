@@ -63,7 +63,12 @@ class Cube:
     >>> import foveasim as fs
     >>> import numpy as np
     >>> data = np.ones((3, 4, 6))  # bands, rows, columns
-    >>> cube = fs.scene.Cube(data=data, wavelength=[0.45, 0.55, 0.65], wavelength_unit="um", quantity="reflectance")
+    >>> cube = fs.scene.Cube(
+    ...     data=data,
+    ...     wavelength=[0.45, 0.55, 0.65],
+    ...     wavelength_unit="um",
+    ...     quantity="reflectance",
+    ... )
     >>> cube.data.shape, cube.wavelength_unit
     ((3, 4, 6), 'um')
     """

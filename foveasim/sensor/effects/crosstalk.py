@@ -71,7 +71,9 @@ class CrosstalkOperator:
     --------
     >>> import foveasim as fs
     >>> row = fs.layout.grid(n_x=3, n_y=1, pitch_um=4.0)
-    >>> operator = fs.sensor.Diffusion.from_neighbour_fraction(0.1, pitch_um=4.0).compile(row)
+    >>> operator = fs.sensor.Diffusion.from_neighbour_fraction(0.1, pitch_um=4.0).compile(
+    ...     row
+    ... )
     >>> operator.apply([0.0, 1000.0, 0.0]).round(6).tolist()
     [25.0, 950.0, 25.0]
     """
@@ -301,7 +303,9 @@ class Diffusion(_Crosstalk):
     --------
     >>> import foveasim as fs
     >>> pair = fs.layout.grid(n_x=2, n_y=1, pitch_um=4.0)
-    >>> Diffusion.from_neighbour_fraction(0.2, pitch_um=4.0).compile(pair).apply([1000.0, 0.0]).round(9).tolist()
+    >>> Diffusion.from_neighbour_fraction(0.2, pitch_um=4.0).compile(pair).apply(
+    ...     [1000.0, 0.0]
+    ... ).round(9).tolist()
     [950.0, 50.0]
     """
 
@@ -409,7 +413,9 @@ class KernelCrosstalk(_Crosstalk):
     --------
     >>> import foveasim as fs
     >>> upwards = KernelCrosstalk(kernel=((0.0,), (0.75,), (0.25,)))
-    >>> upwards.compile(fs.layout.grid(n_x=1, n_y=3, pitch_um=2.0)).apply([100.0, 0.0, 8.0]).tolist()
+    >>> upwards.compile(fs.layout.grid(n_x=1, n_y=3, pitch_um=2.0)).apply(
+    ...     [100.0, 0.0, 8.0]
+    ... ).tolist()
     [75.0, 25.0, 8.0]
     """
 
@@ -515,7 +521,9 @@ class InterPixelCapacitance(_Crosstalk):
     --------
     >>> import foveasim as fs
     >>> row = fs.layout.grid(n_x=3, n_y=1, pitch_um=4.0)
-    >>> InterPixelCapacitance(neighbour_fraction=0.01).compile(row).apply([0, 5000, 0]).tolist()
+    >>> InterPixelCapacitance(neighbour_fraction=0.01).compile(row).apply(
+    ...     [0, 5000, 0]
+    ... ).tolist()
     [50.0, 4900.0, 50.0]
     """
 

@@ -74,7 +74,9 @@ def dark_current_factor(
     --------
     At -40 °C, the doubling rule is 3.2 times as bright as generation alone:
 
-    >>> generation = dark_current_factor(233.0, 300.0, "diffusion_generation", diffusion_fraction=0.0)
+    >>> generation = dark_current_factor(
+    ...     233.0, 300.0, "diffusion_generation", diffusion_fraction=0.0
+    ... )
     >>> round(dark_current_factor(233.0, 300.0) / generation, 1)
     3.2
     """

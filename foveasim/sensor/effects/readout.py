@@ -56,7 +56,11 @@ class ReadNoise(Declared, AdditiveNoise):
     >>> import foveasim as fs
     >>> import numpy as np
     >>> sensor = fs.Sensor(fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), read_noise_e=3.0)
-    >>> next(effect for effect in sensor.chain if isinstance(effect, fs.sensor.effects.ReadNoise))
+    >>> next(
+    ...     effect
+    ...     for effect in sensor.chain
+    ...     if isinstance(effect, fs.sensor.effects.ReadNoise)
+    ... )
     ReadNoise(read_noise_e=3.0)
     """
 

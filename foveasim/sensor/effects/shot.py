@@ -176,7 +176,9 @@ def draw_shot_noise(
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> electrons = fs.sensor.draw_shot_noise(np.full(100_000, 400.0), "exact", 500.0, seed=0)
+    >>> electrons = fs.sensor.draw_shot_noise(
+    ...     np.full(100_000, 400.0), "exact", 500.0, seed=0
+    ... )
     >>> round(float(electrons.mean())), round(float(electrons.std()))
     (400, 20)
     """

@@ -92,9 +92,14 @@ class Linearisation:
     >>> import foveasim as fs
     >>> import numpy as np
     >>> layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0)
-    >>> sensor = fs.Sensor(layout, read_noise_e=10.0, capacitance_f=1.6e-15, v_sat_v=1.0, bits=14)
+    >>> sensor = fs.Sensor(
+    ...     layout, read_noise_e=10.0, capacitance_f=1.6e-15, v_sat_v=1.0, bits=14
+    ... )
     >>> model = sensor.linearise(np.full(16, 900.0))
-    >>> list(model.sources), round(float(np.sqrt(model.variance_e2()[0])), 1)  # √(900 + 100), and quantisation
+    >>> (
+    ...     list(model.sources),
+    ...     round(float(np.sqrt(model.variance_e2()[0])), 1),
+    ... )  # √(900 + 100), and quantisation
     (['shot', 'read', 'quantisation'], 31.6)
     """
 

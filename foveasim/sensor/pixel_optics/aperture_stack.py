@@ -71,7 +71,9 @@ class ApertureStack(PixelOptics):
     >>> layout = fs.Layout.from_rectangles([[0.0, 0.0]], 4.0)
     >>> lens = fs.Optics(focal_length_mm=8.0, f_number=2.0)
     >>> stack = ApertureStack(height_um=2.0, refractive_index=1.5)
-    >>> stack.footprints(layout, lens.incidence(layout.centroid_um)).response.round(3).tolist()
+    >>> stack.footprints(layout, lens.incidence(layout.centroid_um)).response.round(
+    ...     3
+    ... ).tolist()
     [0.932]
     """
 

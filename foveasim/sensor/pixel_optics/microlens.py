@@ -82,7 +82,9 @@ class Microlens(PixelOptics):
     >>> layout = fs.Layout.from_rectangles([[0.0, 0.0], [2000.0, 0.0]], 3.0)
     >>> cones = fs.Optics(focal_length_mm=8.0, f_number=2.8).incidence(layout.centroid_um)
     >>> for shift in ("none", "optimal"):
-    ...     optics = Microlens(height_um=4.0, refractive_index=1.5, shift=shift, photodiode_inset_um=0.5)
+    ...     optics = Microlens(
+    ...         height_um=4.0, refractive_index=1.5, shift=shift, photodiode_inset_um=0.5
+    ...     )
     ...     optics.footprints(layout, cones).response.round(2).tolist()
     [1.0, 0.95]
     [1.0, 1.0]

@@ -109,7 +109,9 @@ class GaussianCurve(CurveBase):
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.sensor.GaussianCurve(centre_nm=550.0, fwhm_nm=80.0, peak=0.9)([550.0, 590.0]).round(3).tolist()
+    >>> fs.sensor.GaussianCurve(centre_nm=550.0, fwhm_nm=80.0, peak=0.9)(
+    ...     [550.0, 590.0]
+    ... ).round(3).tolist()
     [0.9, 0.45]
     """
 
@@ -248,7 +250,9 @@ class ProductCurve(CurveBase):
     Examples
     --------
     >>> import foveasim as fs
-    >>> stack = fs.sensor.ProductCurve([fs.sensor.ConstantCurve(0.9), fs.sensor.SiliconQE(depth_um=3.0)])
+    >>> stack = fs.sensor.ProductCurve(
+    ...     [fs.sensor.ConstantCurve(0.9), fs.sensor.SiliconQE(depth_um=3.0)]
+    ... )
     >>> stack([550.0]).round(3).tolist()
     [0.768]
     """

@@ -153,7 +153,9 @@ def read_filters(
     >>> import foveasim as fs
     >>> with tempfile.TemporaryDirectory() as directory:
     ...     path = Path(directory, "filters.csv")
-    ...     _ = path.write_text("nm,R,G,B\n450,0.02,0.1,0.8\n550,0.05,0.9,0.1\n650,0.9,0.1,0.02\n")
+    ...     _ = path.write_text(
+    ...         "nm,R,G,B\n450,0.02,0.1,0.8\n550,0.05,0.9,0.1\n650,0.9,0.1,0.02\n"
+    ...     )
     ...     filters = fs.sensor.read_filters(path)
     >>> filters.names, filters.curves[1]([550.0]).tolist()
     (('R', 'G', 'B'), [0.9])

@@ -41,7 +41,10 @@ class FilterSet:
     Examples
     --------
     >>> import foveasim as fs
-    >>> bands = [fs.sensor.GaussianCurve(centre_nm=centre_nm, fwhm_nm=60.0) for centre_nm in (450.0, 550.0)]
+    >>> bands = [
+    ...     fs.sensor.GaussianCurve(centre_nm=centre_nm, fwhm_nm=60.0)
+    ...     for centre_nm in (450.0, 550.0)
+    ... ]
     >>> filters = fs.sensor.FilterSet(bands, ["B", "G"])
     >>> filters.names
     ('B', 'G')

@@ -74,7 +74,9 @@ class PolynomialCurve(_Sampled):
     Examples
     --------
     >>> import foveasim as fs
-    >>> curve = fs.sensor.PolynomialCurve(wavelength_nm=[400, 500, 600, 700], value=[0.3, 0.6, 0.6, 0.4], degree=2)
+    >>> curve = fs.sensor.PolynomialCurve(
+    ...     wavelength_nm=[400, 500, 600, 700], value=[0.3, 0.6, 0.6, 0.4], degree=2
+    ... )
     >>> curve([550.0]).round(3).tolist()
     [0.631]
     """
@@ -127,7 +129,9 @@ class TableCurve(_Table):
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.sensor.TableCurve(wavelength_nm=[400, 500, 700], value=[0.2, 0.6, 0.4])([450.0, 600.0]).round(3).tolist()
+    >>> fs.sensor.TableCurve(wavelength_nm=[400, 500, 700], value=[0.2, 0.6, 0.4])(
+    ...     [450.0, 600.0]
+    ... ).round(3).tolist()
     [0.4, 0.5]
     """
 
@@ -157,7 +161,9 @@ class SplineCurve(_Table):
     Examples
     --------
     >>> import foveasim as fs
-    >>> curve = fs.sensor.SplineCurve(wavelength_nm=[400, 500, 600, 700], value=[0.3, 0.6, 0.6, 0.4])
+    >>> curve = fs.sensor.SplineCurve(
+    ...     wavelength_nm=[400, 500, 600, 700], value=[0.3, 0.6, 0.6, 0.4]
+    ... )
     >>> curve([450.0, 550.0]).round(3).tolist()
     [0.506, 0.6]
     """
@@ -194,7 +200,9 @@ class StepCurve(CurveBase):
     Examples
     --------
     >>> import foveasim as fs
-    >>> fs.sensor.StepCurve(edge_nm=[400, 500, 700], value=[0.4, 0.6])([450.0, 550.0]).tolist()
+    >>> fs.sensor.StepCurve(edge_nm=[400, 500, 700], value=[0.4, 0.6])(
+    ...     [450.0, 550.0]
+    ... ).tolist()
     [0.4, 0.6]
     """
 

@@ -91,7 +91,9 @@ def to_png(picture: Picture) -> bytes:
     >>> import foveasim as fs
     >>> import numpy as np
     >>> layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
-    >>> picture = fs.reconstruct.cells(layout, np.arange(16.0), fs.Grid.centred((8, 8), 1.0))
+    >>> picture = fs.reconstruct.cells(
+    ...     layout, np.arange(16.0), fs.Grid.centred((8, 8), 1.0)
+    ... )
     >>> fs.view.to_png(picture)[1:4]
     b'PNG'
     """

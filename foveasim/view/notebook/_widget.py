@@ -47,7 +47,9 @@ def widget(
     Examples
     --------
     >>> import foveasim as fs
-    >>> view = fs.view.widget(fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0), name="a small grid")
+    >>> view = fs.view.widget(
+    ...     fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0), name="a small grid"
+    ... )
     >>> view.by = "area_um2"
     >>> view.by, view.pinned
     ('area_um2', -1)
@@ -55,7 +57,7 @@ def widget(
     Select sites in the widget by a rectangle, or in Python, and read their values::
 
         view = fs.view.widget(capture)
-        view                                   # last line of a cell
+        view  # last line of a cell
         view.by = "electrons"
         capture.electrons[view.selected].mean()
     """

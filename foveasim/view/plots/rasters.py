@@ -66,7 +66,9 @@ def plot_scene(scene: Scene, *, ax: Axes | None = None, figure_inches: Annotated
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = fs.scene.charts.slanted_edge(shape=(64, 64), pitch_um=500.0, distance_m=1.0, luminance_cd_m2=100.0)
+    >>> scene = fs.scene.charts.slanted_edge(
+    ...     shape=(64, 64), pitch_um=500.0, distance_m=1.0, luminance_cd_m2=100.0
+    ... )
     >>> fs.view.plot_scene(scene).get_xlabel()
     'x / mm'
     """
@@ -116,7 +118,9 @@ def plot_power_map(
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
     >>> power_map = fs.Optics(focal_length_mm=8.0, f_number=2.8).power_map(scene)
     >>> axes = fs.view.plot_power_map(power_map)
     >>> axes.figure.axes[1].get_ylabel()  # of the colour bar
@@ -171,7 +175,9 @@ def plot_picture(
     >>> import foveasim as fs
     >>> import numpy as np
     >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
-    >>> picture = fs.reconstruct.cells(layout, layout.area_um2, fs.Grid.centred((16, 16), 1.0))
+    >>> picture = fs.reconstruct.cells(
+    ...     layout, layout.area_um2, fs.Grid.centred((16, 16), 1.0)
+    ... )
     >>> fs.view.plot_picture(picture).get_ylabel()
     'y / µm'
     """
@@ -231,7 +237,14 @@ def plot_image(
     >>> import foveasim as fs
     >>> import numpy as np
     >>> values = np.random.default_rng(0).random((20, 30))
-    >>> axes = fs.view.plot_image(values, (0.0, 0.0, 3.0, 2.0), "time / s", "frequency / Hz", label="power", ratio=0.5)
+    >>> axes = fs.view.plot_image(
+    ...     values,
+    ...     (0.0, 0.0, 3.0, 2.0),
+    ...     "time / s",
+    ...     "frequency / Hz",
+    ...     label="power",
+    ...     ratio=0.5,
+    ... )
     >>> [text.get_ylabel() for text in axes.figure.axes]  # image and colour bar
     ['frequency / Hz', 'power']
     """

@@ -67,7 +67,9 @@ def plot_results(
     Examples
     --------
     >>> import xarray as xr
-    >>> sweep = xr.Dataset({"snr_mean": ("sensor.bits", [20.0, 31.0])}, {"sensor.bits": [8, 10]})
+    >>> sweep = xr.Dataset(
+    ...     {"snr_mean": ("sensor.bits", [20.0, 31.0])}, {"sensor.bits": [8, 10]}
+    ... )
     >>> plot_results(sweep).get_xlabel()
     'sensor.bits'
     """

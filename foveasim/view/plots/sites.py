@@ -104,7 +104,9 @@ def plot_layout(
     Examples
     --------
     >>> import foveasim as fs
-    >>> axes = fs.view.plot_layout(fs.layout.hexagonal(n_columns=9, n_rows=9, pitch_um=3.0), "area_um2")
+    >>> axes = fs.view.plot_layout(
+    ...     fs.layout.hexagonal(n_columns=9, n_rows=9, pitch_um=3.0), "area_um2"
+    ... )
     >>> axes.get_xlabel()
     'x / µm'
     """
@@ -147,10 +149,18 @@ def plot_capture(
     Examples
     --------
     >>> import foveasim as fs
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
-    >>> sensor = fs.Sensor.from_preset(fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision")
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
-    >>> axes = fs.view.plot_capture(camera.capture(scene, exposure_s="auto", seed=0), "electrons")
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
+    >>> sensor = fs.Sensor.from_preset(
+    ...     fs.layout.grid(n_x=16, n_y=16, pitch_um=3.45), "machine_vision"
+    ... )
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor
+    ... )
+    >>> axes = fs.view.plot_capture(
+    ...     camera.capture(scene, exposure_s="auto", seed=0), "electrons"
+    ... )
     >>> axes.get_xlabel()
     'x / µm'
     """
@@ -180,8 +190,13 @@ def plot_angular_response(camera: Camera, light: Scene | PowerMap, *, ax: Axes |
     >>> import foveasim as fs
     >>> stack = fs.sensor.ApertureStack(height_um=4.0, refractive_index=1.5)
     >>> layout = fs.layout.log_polar(n_sectors=24, r_min_um=20.0, r_max_um=200.0, n_rings=9)
-    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=fs.Sensor(layout, pixel_optics=stack))
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0)
+    >>> camera = fs.Camera(
+    ...     optics=fs.Optics(focal_length_mm=8.0, f_number=2.8),
+    ...     sensor=fs.Sensor(layout, pixel_optics=stack),
+    ... )
+    >>> scene = fs.Scene.flat(
+    ...     shape=(64, 64), pitch_um=500.0, distance_m=1.0, illuminance_lux=500.0
+    ... )
     >>> axes = fs.view.plot_angular_response(camera, scene)
     >>> axes.get_xlabel(), axes.get_ylabel()
     ('image height / µm', 'response to uniform light')
@@ -225,7 +240,9 @@ def plot_noise_budget(
     --------
     >>> import foveasim as fs
     >>> import numpy as np
-    >>> sensor = fs.Sensor(fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), read_noise_e=5.0, prnu_fraction=0.01)
+    >>> sensor = fs.Sensor(
+    ...     fs.layout.grid(n_x=8, n_y=8, pitch_um=3.0), read_noise_e=5.0, prnu_fraction=0.01
+    ... )
     >>> budget = fs.sensor.noise_budget(sensor, np.full(64, 1e5), 0.01)
     >>> axes = fs.view.plot_noise_budget(budget)
     >>> axes.get_xlabel(), [label.get_text() for label in axes.get_yticklabels()]
@@ -289,7 +306,10 @@ def plot_curves(
     >>> import numpy as np
     >>> frequency_per_mm = np.linspace(0.0, 300.0, 31)
     >>> lenses = {f"f/{n}": fs.Optics(focal_length_mm=8.0, f_number=n) for n in (2.8, 8.0)}
-    >>> curves = {name: (frequency_per_mm, lens.mtf(frequency_per_mm, 550.0)) for name, lens in lenses.items()}
+    >>> curves = {
+    ...     name: (frequency_per_mm, lens.mtf(frequency_per_mm, 550.0))
+    ...     for name, lens in lenses.items()
+    ... }
     >>> axes = fs.view.plot_curves(curves, "spatial frequency / (1/mm)", "MTF")
     >>> [text.get_text() for text in axes.get_legend().get_texts()]
     ['f/2.8', 'f/8.0']
@@ -366,7 +386,9 @@ def save_drawing(data: Layout | Capture, path: str | Path, by: str | ArrayLike |
     >>> import foveasim as fs
     >>> with tempfile.TemporaryDirectory() as directory:
     ...     path = Path(directory, "layout.svg")
-    ...     fs.view.save_drawing(fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0), path)
+    ...     fs.view.save_drawing(
+    ...         fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0), path
+    ...     )
     ...     print(path.read_text("utf-8").count("<path"))
     16
     """

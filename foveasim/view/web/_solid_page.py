@@ -50,7 +50,9 @@ def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: st
     Examples
     --------
     >>> import foveasim as fs
-    >>> page = fs.view.solid_page(fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), name="four photosites")
+    >>> page = fs.view.solid_page(
+    ...     fs.layout.grid(n_x=2, n_y=2, pitch_um=3.0), name="four photosites"
+    ... )
     >>> "<title>four photosites</title>" in page
     True
     """
