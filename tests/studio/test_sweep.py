@@ -99,6 +99,16 @@ def test_points_equal_results_of_set_values(recorder, make_session, axis):
         assert (capture.code == captured(state["settings"]).code).all()
 
 
+def test_points_of_signals_have_saturation(recorder):
+    exposure = [{"key": "exposure_s", "from": 0.001, "to": 0.5, "n": 3, "spacing": "geometric"}]
+    found = run(recorder, exposure, [{"measure": "snr"}])
+    codes = [captured({**SETTINGS, "exposure_s": value}).code for value in found["axes"][0]["values"]]
+
+    assert found["saturated"] == [float(np.mean(each == 1023)) for each in codes]
+    assert found["saturated"][0] == 0.0 < found["saturated"][-1]
+    assert run(recorder, exposure, [{"measure": "n_sites"}], number=8)["saturated"] == [0.0, 0.0, 0.0]
+
+
 def test_integers_are_distinct(recorder):
     found = run(recorder, [{"key": "sensor.bits", "from": 8, "to": 10, "n": 9}], [CODE])
     assert found["axes"][0]["values"] == [8, 9, 10]

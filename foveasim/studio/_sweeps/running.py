@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from foveasim.config import RegionResult, check_settings
 from foveasim.errors import SimulationError
 from foveasim.explore import result_of
+from foveasim.metrics import metric_info
 from foveasim.studio._costs import SupersededError
 from foveasim.studio._engine import Simulated
 from foveasim.studio._messages.models import Message, SendSweepFile, StartSweep, StopSweep, handles
@@ -52,6 +53,9 @@ class Sweep:
         self._settings: list[dict[str, Any] | None] = [None] * len(self._points)
         #: Values of the results: of the settings at the start, and of the points so far.
         self._values: list[list[float]] = []
+        #: Fraction of saturated photosites in these, where a result depends on it.
+        self._saturated: list[float] = []
+        self._is_of_signals = any(metric_info(each.measure).is_of_signals for each in results)
         self._problem = ""
         self.is_stopped = False
         #: Time of the first interruption of the present point.
@@ -81,7 +85,7 @@ class Sweep:
 
         Raises SupersededError when the simulation was interrupted: the point is then still the next one.
         """
-        values = [math.nan] * len(self.results)
+        values, saturated = [math.nan] * len(self.results), 0.0
         try:
             done = len(self._values)
             simulated = simulate(self.base if done == 0 else self.settings_of(done - 1))
@@ -92,8 +96,10 @@ class Sweep:
             self._explain(line(error))
         else:
             values = [self._measured(result, simulated, line) for result in self.results]
+            saturated = simulated.capture.saturated_fraction if self._is_of_signals else 0.0
         self.stopped_s = None
         self._values.append(values)
+        self._saturated.append(saturated)
 
     def _measured(self, result: RegionResult, simulated: Simulated, line: Callable[[BaseException], str]) -> float:
         """Return a result; NaN after an error, which is stored."""
@@ -125,6 +131,7 @@ class Sweep:
             "n_points": len(self._points),
             "start": {"settings": list(self._present), "results": self._values[0] if self._values else None},
             "points": points,
+            "saturated": self._saturated[1:],
             "problem": self._problem,
             "n_failed": sum(any(math.isnan(value) for value in point) for point in points),
         }
