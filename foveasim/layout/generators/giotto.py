@@ -90,7 +90,7 @@ def giotto(
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
-    Generate ``n_fovea`` rings of unit height, then rings that grow by the ratio λ.
+    Generate a fovea of rings of equal height, then rings that grow by a constant ratio.
 
     ::
 

@@ -100,7 +100,7 @@ def log_polar(
     n_sites: int | None = None,  # noqa: ARG001 -- resolved by layout_generator
 ) -> Layout:
     """
-    Generate rings of ``n_sectors`` sites that grow outwards by ``ring_ratio``.
+    Generate log-polar rings of sites that grow outwards by a constant ratio.
 
     ::
 
