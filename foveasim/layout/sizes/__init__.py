@@ -1,1 +1,1 @@
-"""Sizes of layouts: numbers of sites, optical formats, and parameters of generators for them."""
+"""Sizes of layouts: numbers of sites, optical formats, and layouts from sizes."""
