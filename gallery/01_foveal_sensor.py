@@ -132,7 +132,7 @@ def main(out_dir: Path, step: int = 1) -> None:
         for name, camera in cameras.items()
     }
 
-    # %% Number of photosites and PSNR of both parts, in light.
+    # %% Number of photosites in both parts, and PSNR of the light that they estimate.
     counts, quality_db = {}, {}
     for name, camera in cameras.items():
         for title, part in (("face", face), ("shuttle", shuttle)):
@@ -143,7 +143,7 @@ def main(out_dir: Path, step: int = 1) -> None:
                 found, camera.reference(scene, grid, exposure_s=exposure_s)
             )
 
-    # %% One figure of all.
+    # %% Figure: both pictures, and the parts enlarged.
     figure = draw(
         layouts, captures, {"face": face, "shuttle": shuttle}, counts, quality_db
     )

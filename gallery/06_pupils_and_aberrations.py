@@ -8,8 +8,8 @@ New here: ``Optics(pupil=, zernike=, seidel=, focus_distance_m=)``, ``Optics.psf
 Expect: diffraction spikes perpendicular to edges and vanes; a coma flare in +y, where
 its wavefront error increases; Strehl ratios of 0.814 to 0.817 for 1/14 wave rms of any
 aberration; a field of points with flares away from the axis, computed with 7 x 7
-isoplanatic patches, which displace up to a third of the PSF energy when each fringe
-counts.
+isoplanatic patches. As every diffraction fringe counts, these patches displace up to a
+third of the energy of a PSF.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@ Where does a layout violate its design rules, and by how much?
 
 New here: ``Layout.check`` on a layout with deliberate violations, ``Report.plot``.
 
-Expect: the 2 slivers, 1 overlap, 2 pixels below the minimum size and 1 narrow space
-that are inserted into a grid of 60 sites, and no other violation.
+Expect: 2 slivers, 1 overlap, 2 photosites below the minimum size and 1 narrow space,
+which are inserted into a grid of 60 sites, and no other violation.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ RULES = fs.DesignRules(
     max_overlap_um2=0.0,
     min_angle_deg=30.0,
 )
-#: Inserted violations: width of a sliver, side of a small pixel, width of an overlap,
+#: Inserted violations: width of a sliver, side of a small site, width of an overlap,
 #: width of a space.
 SLIVER_UM, SMALL_SIDE_UM, OVERLAP_UM, SPACE_UM = 0.6, 1.5, 0.4, 0.2
 #: Sites with violations, and their names in the figure.
@@ -74,8 +74,8 @@ def main(out_dir: Path) -> None:
     layout = layout_with_violations()
     report = layout.check(RULES)
 
-    # %% Photosites in grey, violations in the colours of their rules, and the names of
-    # what is inserted.
+    # %% Photosites in grey, violations in the colours of their rules, with the names of
+    # the inserted violations.
     print(report)
     axes = report.plot(layout, figure_inches=8.0)
     for site, text in INSERTED.items():

@@ -1,5 +1,5 @@
 """
-Which solids does the stack of a foveal sensor consist of?
+What do the layers of a foveal sensor look like as solids?
 
 New here: ``view.SensorStack``, ``view.solids``, ``view.stack``, ``Solids.check``,
 ``Solids.write``, ``view.render``.

@@ -7,7 +7,7 @@ photosites.
 Expect: the same photograph through four sensors that differ only in the centre. Without
 a fovea, a disc with a radius of 60.12 µm has no data (11,355 µm² within 0.5 %, since
 its boundary consists of chords). Hexagons, rings and linear rings cover it, and no
-pixel is smaller than the minimum size of 2 µm.
+photosite is smaller than the minimum size of 2 µm.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ SINE_DEG = 22.5
 def edge_and_closed_form(
     layout: fs.Layout,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return frequencies and MTFs: slanted edge; lens, chart and pixel; pixel only."""
+    """Return frequencies and MTFs: slanted edge; lens, chart and site; site only."""
     chart = charts.slanted_edge(
         angle_deg=ANGLE_DEG,
         shape=(600, 600),
@@ -116,7 +116,7 @@ def spectra(
 def main(out_dir: Path) -> None:
     """Write the curves and the spectra to a directory."""
     out_dir.mkdir(parents=True, exist_ok=True)
-    # %% MTF of lens and pixels, by a slanted edge and in closed form.
+    # %% MTF of lens and photosites, by a slanted edge and in closed form.
     sensors = {
         "squares": fs.layout.grid(n_x=56, n_y=56, pitch_um=PITCH_UM),
         "hexagons": fs.layout.hexagonal(n_columns=56, n_rows=64, pitch_um=PITCH_UM),

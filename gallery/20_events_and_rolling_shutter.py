@@ -100,8 +100,8 @@ def main(out_dir: Path) -> None:
     out_dir.mkdir(parents=True, exist_ok=True)
     optics = fs.Optics(focal_length_mm=FOCAL_LENGTH_MM, f_number=2.8)
 
-    # %% A sensor read row by row, from the top of the picture, and one exposure with
-    # each shutter.
+    # %% A sensor that is read row by row, from the top of the picture; one exposure
+    # with each shutter.
     grid = readout_by(fs.layout.grid(n_x=N_LINES, n_y=N_LINES, pitch_um=PITCH_UM))
     camera = fs.Camera(
         optics=optics,
@@ -147,8 +147,7 @@ def main(out_dir: Path) -> None:
         rates, frame_s=FRAME_S, seed=3
     )
 
-    # %% Rotation rate with the highest phase coherence of ON events relative to the
-    # blades.
+    # %% Rotation rate: that at which ON events are most coherent with the blades.
     angle = np.arctan2(rings.centroid_um[:, 1], rings.centroid_um[:, 0])
     is_on = events.polarity > 0
     on_s, on_angle = events.t_s[is_on], angle[events.site[is_on]]
@@ -174,7 +173,7 @@ def main(out_dir: Path) -> None:
         rolling_shutter.code,
         "gray",
         max_dn,
-        f"rolling shutter, {1e3 * LINE_S:g} ms per line,\nbottom first",
+        f"rolling shutter, {1e3 * LINE_S:g} ms per line,\ntop line first",
     )
     plot_sites(
         axes[0, 2],

@@ -4,8 +4,8 @@ Which foveal sensors give the best picture for their number of photosites?
 New here: ``foveasim.explore.study``: a search with two objectives and a constraint,
 with a Pareto front.
 
-Expect: about ten of 40 sensors on the Pareto front, all with photosites on at least 92
-% of the field; along the front, PSNR increases with the number of photosites.
+Expect: about ten of 40 sensors on the Pareto front, all with photosites on at least
+92 % of the field; along the front, PSNR increases with the number of photosites.
 """
 
 from __future__ import annotations

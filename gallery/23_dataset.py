@@ -1,5 +1,5 @@
 """
-How are datasets for networks generated that are robust to the camera or to its noise?
+How do I generate datasets that make a network robust to cameras, or to their noise?
 
 New here: ``foveasim.explore.classification`` and ``denoising``, ``Dataset``,
 ``write_dataset``.
@@ -96,8 +96,7 @@ def main(out_dir: Path, n_cameras: int = N_CAMERAS) -> None:
     out_dir.mkdir(parents=True, exist_ok=True)
     photograph = skimage.data.astronaut()
 
-    # %% Classification: the same class for all layouts, lenses, exposures and
-    # electronics.
+    # %% Classification: one class, whatever the layout, lens, exposure and electronics.
     data = explore.classification(
         [photograph],
         SHOT,

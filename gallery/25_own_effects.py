@@ -1,5 +1,5 @@
 """
-How are user-defined effects added to a sensor: 1/f noise of the readout, and lens
+How do I add effects of my own to a sensor, here 1/f noise of the readout and lens
 shading?
 
 New here: ``sensor.effects.AdditiveNoise``, ``sensor.effects.FixedFactor``,

@@ -7,11 +7,11 @@ its GDSII file.
 
 Expect: with 1,023 to 1,033 photosites and the same noise, FOVI's layout reads 89.5 ±
 0.4 % of the digits, a log-polar one 88.1 ± 0.9 %, and a square grid 70.4 ± 1.8 % (three
-seeds, ``--full``). Digits near the gaze are read by the foveal layouts (99 %, the grid
-75 %), digits 30 to 40 µm away by the grid (51 %, FOVI 30 %, log-polar 16 %). Vertices
-learned from the grid read 79.8 ± 1.6 %; learned from FOVI's layout they do not help
-(87.5 ± 0.8 %). The learned layouts as GDSII have no violations, and read as many
-digits: 79.3 ± 1.7 % and 87.6 ± 0.9 %.
+seeds, ``--full``). Near the gaze, foveal layouts are better (99 %, the grid 75 %), at
+30 to 40 µm the grid (51 %, FOVI 30 %, log-polar 16 %). Vertices learned from the grid
+read 79.8 ± 1.6 %; learned from FOVI's layout they do not help (87.5 ± 0.8 %). Written
+as GDSII, the learned layouts have no violations, and read as many digits: 79.3 ± 1.7 %
+and 87.6 ± 0.9 %.
 """
 
 from __future__ import annotations
