@@ -7,7 +7,7 @@ passwords and tokens of the parent, and a session of its own. On Linux (x86-64 a
 filters of system calls, it can also not open network sockets, start processes or programs, or send signals.
 
 It does not protect against code in a file that takes control of the process: the process runs as the same user, and can read
-and write the files of this user. Programs that read files of unknown origin for others should run as a user without
+and write the files of this user. Programs that read untrusted files for others should run as a user without
 privileges, or in a container.
 """
 

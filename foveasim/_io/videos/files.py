@@ -260,7 +260,7 @@ def _as_video_error(path: Path, problem: str) -> Iterator[None]:
 
 class SandboxedVideo:
     """
-    Video file of unknown origin, read in the sandbox process: as :class:`VideoFile`.
+    Untrusted video file, read in the sandbox process: as :class:`VideoFile`.
 
     Raises FileError when the file is not a readable video, exceeds a limit, or has frames without time stamps.
     """
