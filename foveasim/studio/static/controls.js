@@ -328,8 +328,7 @@ class Row {
     this.reset.hidden = !isChanged;
     this.error.hidden = !error;
     this.error.textContent = error || "";
-    if (error) this.field?.setAttribute("aria-invalid", "true");
-    else this.field?.removeAttribute("aria-invalid");
+    if (this.field) this.field.ariaInvalid = error ? "true" : null;
     this.value = value;
     // Settings that are absent and may be are behind a button.
     this.isExtra = Boolean(this.control.is_optional) && !this.control.is_value && this.control.kind !== "group"

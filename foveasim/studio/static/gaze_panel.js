@@ -268,8 +268,7 @@ export class GazePanel {
   _create() {
     const values = [...$("saccades-form").querySelectorAll("input")].map((field) => {
       const value = numberOf(field.value, field.dataset.unit);
-      if (Number.isFinite(value)) field.removeAttribute("aria-invalid");
-      else field.setAttribute("aria-invalid", "true");
+      field.ariaInvalid = Number.isFinite(value) ? null : "true";
       return [field.name, value];
     });
     if (!values.every(([, value]) => Number.isFinite(value))) return false;
