@@ -84,7 +84,7 @@ export class GazePanel {
   }
 
   _menu() {
-    const { frame, menu } = menuOf("Path", () => {}, { id: "gaze-menu" });
+    const { frame, menu } = menuOf("Path", { id: "gaze-menu" });
     this.chosen = make("input", undefined, { type: "file", accept: ".csv,text/csv", className: "unseen", tabIndex: -1, id: "chosen-gaze",
       ariaLabel: "CSV file of a gaze path" });
     this.chosen.addEventListener("change", () => {

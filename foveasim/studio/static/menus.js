@@ -29,10 +29,10 @@ export function listenToMenu(button, menu) {
   });
 }
 
-// A button that calls act() and opens a menu, which ends at its right.
-/** @param {string} text @param {() => void} act @param {Partial<HTMLButtonElement>} about */
-export function menuOf(text, act, about) {
-  const button = buttonOf(text + " ", act, about), menu = make("div", undefined, { className: "menu right", hidden: true });
+// A button that opens a menu, which ends at its right, after fill().
+/** @param {string} text @param {Partial<HTMLButtonElement>} about */
+export function menuOf(text, about, fill = () => {}) {
+  const button = buttonOf(text + " ", fill, about), menu = make("div", undefined, { className: "menu right", hidden: true });
   button.append(make("span", "▾", { ariaHidden: "true" }));
   listenToMenu(button, menu);
   return { menu, frame: around("div", "menu-frame", button, menu) };

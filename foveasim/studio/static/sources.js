@@ -48,7 +48,7 @@ export class Sources {
 
   _build() {
     const title = "Photograph, video, folder, camera or test chart as the scene";
-    const { frame, menu } = menuOf("Source", () => this._fillMenu(), { id: "source", title });
+    const { frame, menu } = menuOf("Source", { id: "source", title }, () => this._fillMenu());
     this.menu = menu;
     this.menu.id = "source-menu";
     this.directory = make("input", undefined, { type: "file", webkitdirectory: true, multiple: true, className: "unseen", tabIndex: -1,
