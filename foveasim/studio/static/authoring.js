@@ -45,8 +45,7 @@ export class Editor {
   // studio: the page through functions; see studio.js.
   constructor(pane, section, button, studio) {
     Object.assign(this, { pane, button, studio });
-    this.canvas = make("canvas", undefined, "ghost");
-    this.canvas.setAttribute("aria-hidden", "true");
+    this.canvas = make("canvas", undefined, { className: "ghost", ariaHidden: "true" });
     pane.root.append(this.canvas);
     this.bar = new ToolBar(section, {
       use: (name) => this.use(name), act: (name) => this.act(name), apply: () => this.tool.enter(),
@@ -139,8 +138,8 @@ export class Editor {
     if (!this.pending) this.ghost = null;
     const [mx, my] = this.move, [sx, sy] = this.shift, found = new Set();
     for (const [x, y] of this.points) {
-      const all = sites.pickAll(x + mx + sx, y + my + sy);
-      if (all.length) found.add(all[all.length - 1]);
+      const site = sites.pick(x + mx + sx, y + my + sy);
+      if (site >= 0) found.add(site);
     }
     return [...found];
   }
@@ -158,7 +157,7 @@ export class Editor {
 
   // -- selection ------------------------------------------------------------------------------------------------------------
 
-  pick(x, y) { const all = this.sites ? this.sites.pickAll(x, y) : []; return all.length ? all[all.length - 1] : -1; }
+  pick(x, y) { return this.sites?.pick(x, y) ?? -1; }
 
   select(sites) { this.studio.select(sites); }
 
@@ -496,8 +495,8 @@ export class Editor {
     const paths = layer ? [{ points: [layer], isClosed: false }] : pathsOf(edit);
     return paths.map((path) => ({ ...path, points: path.points.map(([x, y]) => [x + mx, y + my]) })).flatMap((path) => {
       if (path.points.length > 1 || !sites) return [path];
-      const all = sites.pickAll(...path.points[0]);
-      return all.length && !layer ? [{ site: all[all.length - 1], points: path.points }] : [path];
+      const site = sites.pick(...path.points[0]);
+      return site >= 0 && !layer ? [{ site, points: path.points }] : [path];
     });
   }
 

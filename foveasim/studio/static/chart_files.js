@@ -1,8 +1,9 @@
 // Files of a chart: its numbers as CSV, and its drawing as SVG or PNG.
 
-import { download, inkOf, make, notice } from "/web/page_parts.js";
+import { context2d } from "/web/gl.js";
+import { downloadPicture, downloadText, inkOf, make, notice } from "/web/page_parts.js";
+import { selectOf, svgOf } from "./elements.js";
 
-const SVG = "http://www.w3.org/2000/svg";
 // Size of files in CSS pixels, and pixels of a PNG per CSS pixel.
 export const WIDE = 640, TALL = 400, SHARP = 2;
 
@@ -14,16 +15,12 @@ export class SvgContext {
   /** @type {{ [name: string]: any }[]} */ saved = [];
 
   constructor(width, height, background) {
-    this.root = document.createElementNS(SVG, "svg");
-    this._set(this.root, { xmlns: SVG, viewBox: `0 0 ${width} ${height}`, width, height, "font-family": "system-ui, sans-serif" });
+    this.root = svgOf("svg", { viewBox: `0 0 ${width} ${height}`, width, height, "font-family": "system-ui, sans-serif" });
     this._add("rect", { width, height, fill: background });
   }
 
-  _set(element, values) { for (const [name, value] of Object.entries(values)) element.setAttribute(name, String(value)); }
-
   _add(name, values, text = "") {
-    const element = document.createElementNS(SVG, name);
-    this._set(element, values);
+    const element = svgOf(name, values);
     if (this.transform) element.setAttribute("transform", this.transform);
     if (text) element.textContent = text;
     this.root.append(element);
@@ -65,10 +62,9 @@ export const csvOf = (rows) => rows.map((row) => row.map(cell).join(",")).join("
 // Adds a choice of files to the heading of a tile. chart() returns an object with rows(), and paint({ context, width, height }).
 /** @param {Element} root @param {string} name @param {() => any} chart */
 export function addFiles(root, name, chart) {
-  const select = make("select", undefined, "chart-file");
-  select.setAttribute("aria-label", "Save " + name + " as");
-  select.append(...["Save…", "CSV", "SVG", "PNG"].map((text) => new Option(text, text.toLowerCase())));
+  const select = selectOf(["Save…", "CSV", "SVG", "PNG"].map((text) => [text.toLowerCase(), text]), "Save " + name + " as");
   const file = name.toLowerCase().replaceAll(" ", "_");
+  select.className = "chart-file";
   select.addEventListener("change", () => {
     const kind = select.value, found = chart();
     select.selectedIndex = 0;
@@ -79,19 +75,17 @@ export function addFiles(root, name, chart) {
 }
 
 function save(chart, kind, file) {
-  if (kind === "csv") { download(new Blob([csvOf(chart.rows())], { type: "text/csv" }), file, "csv"); return; }
+  if (kind === "csv") { downloadText(csvOf(chart.rows()), file, "csv", "text/csv"); return; }
   if (kind === "svg") {
     const context = new SvgContext(WIDE, TALL, inkOf("--raised"));
     chart.paint({ context, width: WIDE, height: TALL });
-    download(new Blob([context.toString()], { type: "image/svg+xml" }), file, "svg");
+    downloadText(context.toString(), file, "svg", "image/svg+xml");
     return;
   }
-  const canvas = make("canvas"), context = canvas.getContext("2d");
-  Object.assign(canvas, { width: SHARP * WIDE, height: SHARP * TALL });
-  if (!context) return;
+  const canvas = make("canvas", undefined, { width: SHARP * WIDE, height: SHARP * TALL }), context = context2d(canvas);
   context.scale(SHARP, SHARP);
   context.fillStyle = inkOf("--raised");
   context.fillRect(0, 0, WIDE, TALL);
   chart.paint({ context, width: WIDE, height: TALL });
-  canvas.toBlob((blob) => { if (blob) download(blob, file, "png"); });
+  downloadPicture(canvas, file);
 }

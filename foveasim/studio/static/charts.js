@@ -2,14 +2,14 @@
 
 import { brief, clamp, roundStep, shown } from "/web/colours.js";
 import { watchSize } from "/web/gl.js";
-import { inkOf, make } from "/web/page_parts.js";
+import { around, inkOf, make } from "/web/page_parts.js";
 import { listenToRange } from "/web/shell.js";
 import { addFiles } from "./chart_files.js";
+import { svgOf } from "./elements.js";
 import { sizeOf } from "./frames.js";
 import { quantity, unitText } from "./numbers.js";
 import { fitted } from "./site_pane.js";
 
-const SVG = "http://www.w3.org/2000/svg";
 export const FONT = "11px system-ui, sans-serif";
 // Names of curves with a colour of their own; other curves have the next of the list, by theme.
 const NAMED = { R: ["#c62828", "#ff7b72"], G: ["#1b7f3b", "#5fd37f"], B: ["#1f5fbf", "#7db3ff"], W: ["#566073", "#c3cad6"] };
@@ -69,11 +69,46 @@ const decadeText = (value) => (value >= 1e-3 && value < 1e4 ? String(value) : va
 
 // Conversion of numbers to fractions of an axis, and its ticks.
 export function axisOf(low, high, isLog) {
-  if (!isLog) return { low, high, at: (v) => (v - low) / (high - low), value: (t) => low + t * (high - low),
+  if (!isLog) return { low, high, isLog, at: (v) => (v - low) / (high - low), value: (t) => low + t * (high - low),
     ticks: (most) => ticksOf(low, high, most), text: brief };
   const span = Math.log(high / low);
-  return { low, high, at: (v) => Math.log(v / low) / span, value: (t) => low * Math.exp(t * span),
+  return { low, high, isLog, at: (v) => Math.log(v / low) / span, value: (t) => low * Math.exp(t * span),
     ticks: (most) => decadesOf(low, high, most), text: decadeText };
+}
+
+// Draws the grid of the vertical axis, the ticks of the horizontal one, and their numbers, in the area of a chart.
+export function paintTicks(context, { left, top, w, h, width }, axisX, axisY) {
+  context.strokeStyle = inkOf("--line");
+  context.fillStyle = inkOf("--quiet");
+  context.lineWidth = 1;
+  context.beginPath();
+  context.textAlign = "right";
+  for (const tick of axisY.ticks(Math.max(2, h / (axisY.isLog ? 20 : 34)))) {
+    const y = Math.round(top + h - axisY.at(tick) * h) + 0.5;
+    context.moveTo(left, y);
+    context.lineTo(left + w, y);
+    context.fillText(axisY.text(tick), left - 5, y + 3.5);
+  }
+  context.textAlign = "center";
+  for (const tick of axisX.ticks(Math.max(2, w / (axisX.isLog ? 40 : 60)))) {
+    const x = Math.round(left + axisX.at(tick) * w) + 0.5;
+    context.moveTo(x, top + h);
+    context.lineTo(x, top + h + 4);
+    context.fillText(axisX.text(tick), clamp(x, left + 4, width - 14), top + h + 15);
+  }
+  context.stroke();
+}
+
+// Writes the titles of both axes below and left of the area of a chart.
+export function paintTitles(context, { left, top, w, h, height }, x, y) {
+  context.fillStyle = inkOf("--quiet");
+  context.textAlign = "center";
+  context.fillText(x, left + 0.5 * w, height - 4);
+  context.save();
+  context.translate(9, top + 0.5 * h);
+  context.rotate(-Math.PI / 2);
+  context.fillText(y, 0, 0);
+  context.restore();
 }
 
 // Limits of positive numbers for a logarithmic axis.
@@ -92,11 +127,9 @@ export class CurveChart {
 
   constructor(root, { nameX, nameY, label, log = "", hasZero = true }) {
     Object.assign(this, { root, nameX, nameY, label, log, hasZero });
-    this.canvas = make("canvas");
-    this.canvas.setAttribute("role", "img");
+    this.canvas = make("canvas", undefined, { role: "img" });
     this.legend = make("ul", undefined, "chart-legend");
-    this.note = make("p", "", "chart-note quiet");
-    this.note.hidden = true;
+    this.note = make("p", "", { className: "chart-note quiet", hidden: true });
     root.append(this.canvas, this.legend, this.note);
     this.curves = [];
     this.at = null;
@@ -115,10 +148,8 @@ export class CurveChart {
     this.note.textContent = unitText(note);
     this.note.hidden = !note;
     const own = curves.filter(isMain);
-    this.canvas.setAttribute("aria-label", this.label + ": "
-      + (own.length
-        ? own.map((curve) => curve.label + ", largest value " + shown(Number(limitsOf([curve.y])[1].toPrecision(3)))).join("; ")
-          : "no data"));
+    const largest = own.map((curve) => curve.label + ", largest value " + shown(Number(limitsOf([curve.y])[1].toPrecision(3))));
+    this.canvas.ariaLabel = this.label + ": " + (largest.join("; ") || "no data");
     this.draw();
   }
 
@@ -163,34 +194,10 @@ export class CurveChart {
     const w = width - left - right, h = height - top - bottom;
     const toX = (v) => left + axisX.at(v) * w, toY = (v) => top + h - axisY.at(v) * h;
     if (!target) this.place = (x, y) => [toX(x), toY(y)];
-    context.strokeStyle = inkOf("--line");
-    context.fillStyle = inkOf("--quiet");
-    context.lineWidth = 1;
-    context.beginPath();
-    context.textAlign = "right";
-    for (const tick of axisY.ticks(Math.max(2, h / (isLogY ? 20 : 34)))) {
-      const y = Math.round(toY(tick)) + 0.5;
-      context.moveTo(left, y);
-      context.lineTo(left + w, y);
-      context.fillText(axisY.text(tick), left - 5, y + 3.5);
-    }
-    context.textAlign = "center";
-    for (const tick of axisX.ticks(Math.max(2, w / (isLogX ? 40 : 60)))) {
-      const x = Math.round(toX(tick)) + 0.5;
-      context.moveTo(x, top + h);
-      context.lineTo(x, top + h + 4);
-      context.fillText(axisX.text(tick), clamp(x, left + 4, width - 14), top + h + 15);
-    }
-    context.stroke();
-    context.save();
+    const area = { left, top, w, h, width, height };
+    paintTicks(context, area, axisX, axisY);
     this._drawLines(context, curves, inks, { toX, top, h, right: left + w });
-    context.restore();
-    context.fillText(axisTitle(this.nameX, own[0].unit_x), left + 0.5 * w, height - 4);
-    context.save();
-    context.translate(9, top + 0.5 * h);
-    context.rotate(-Math.PI / 2);
-    context.fillText(axisTitle(this.nameY, own[0].unit_y), 0, 0);
-    context.restore();
+    paintTitles(context, area, axisTitle(this.nameX, own[0].unit_x), axisTitle(this.nameY, own[0].unit_y));
     context.textAlign = "left";
     curves.forEach((curve, k) => {
       context.strokeStyle = inks[k];
@@ -272,13 +279,11 @@ export class CurveChart {
 
   _listCurves(curves, inks, dashes, here, own) {
     const items = curves.map((curve, k) => {
-      const item = make("li"), swatch = swatchOf(inks[k], dashes[k], !isMain(curve));
       const value = here === null ? "" : " " + brief(Number(valueAt(curve, here).toPrecision(3)));
       const line = isMain(curve) ? this.lines.find((one) => one.label === curve.label) : null;
       const text = (curve.isDashed ? "A: " : "") + curve.label + value
         + (line && here === null ? ", " + line.of + " " + quantity(line.x, own[0].unit_x, 3) : "");
-      item.append(swatch, make("span", text));
-      return item;
+      return around("li", {}, swatchOf(inks[k], dashes[k], !isMain(curve)), make("span", text));
     });
     if (here !== null) items.unshift(make("li", quantity(here, own[0].unit_x)));
     this.legend.replaceChildren(...items);
@@ -302,11 +307,9 @@ export function listenToPoints(chart, choose) {
 
 // A short line as in the chart.
 function swatchOf(ink, dash, isThin) {
-  const swatch = document.createElementNS(SVG, "svg"), line = document.createElementNS(SVG, "line");
-  const set = (element, values) => { for (const [name, value] of Object.entries(values)) element.setAttribute(name, value); };
-  set(swatch, { width: "26", height: "8", viewBox: "0 0 26 8", "aria-hidden": "true" });
-  set(line, { x1: "0", x2: "26", y1: "4", y2: "4", stroke: ink, "stroke-dasharray": dash.join(" "), "stroke-width": isThin ? "1" : "2.5" });
-  swatch.append(line);
+  const swatch = svgOf("svg", { width: 26, height: 8, viewBox: "0 0 26 8", "aria-hidden": true });
+  swatch.append(svgOf("line", { x1: 0, x2: 26, y1: 4, y2: 4, stroke: ink, "stroke-dasharray": dash.join(" "),
+    "stroke-width": isThin ? 1 : 2.5 }));
   return swatch;
 }
 
@@ -316,8 +319,7 @@ const isSame = (one, other) => one.label === other.label && one.y.length === oth
 
 // Returns the function "create" of a view that shows curves of the server, with those of variant A as dashed ones.
 export const curveView = (options) => (root) => {
-  const frame = make("div", undefined, "chart"), chart = new CurveChart(frame, options);
-  frame.id = root.id.replace("tile-", "");
+  const frame = make("div", undefined, { className: "chart", id: root.id.replace("tile-", "") }), chart = new CurveChart(frame, options);
   root.append(frame);
   addFiles(root, root.querySelector("h2")?.textContent ?? options.label, () => chart);
   return {
@@ -347,8 +349,7 @@ export class Histogram {
   left = 0; wide = 1;
 
   constructor(root, onRange) {
-    this.canvas = make("canvas");
-    this.canvas.setAttribute("role", "img");
+    this.canvas = make("canvas", undefined, { role: "img" });
     this.root = root;
     root.append(this.canvas);
     watchSize(this.canvas, () => this.draw(...this.drawn));
@@ -425,18 +426,12 @@ export class Histogram {
       if (at >= -0.5 && at <= w + 0.5) context.fillText(isKinds && column.names ? column.names[tick] : brief(tick),
         clamp(left + at, left, width - 14), top + h + 15);
     }
-    context.fillText(axisTitle(column.label, column.unit), left + 0.5 * w, height - 4);
+    paintTitles(context, { left, top, w, h, height }, axisTitle(column.label, column.unit), "photosites");
     if (value !== undefined && Number.isFinite(value)) {
       context.fillStyle = inkOf("--text");
       context.fillRect(clamp(left + scale.fraction(value) * w - 1, left, left + w - 2), top, 2, h);
     }
-    context.save();
-    context.translate(9, top + 0.5 * h);
-    context.rotate(-Math.PI / 2);
-    context.fillStyle = inkOf("--quiet");
-    context.fillText("photosites", 0, 0);
-    context.restore();
-    this.canvas.setAttribute("aria-label", "Histogram of " + column.label + " from " + shown(scale.lowest) + " to " + shown(scale.highest));
+    this.canvas.ariaLabel = "Histogram of " + column.label + " from " + shown(scale.lowest) + " to " + shown(scale.highest);
   }
 }
 
@@ -445,17 +440,14 @@ export function barRows(sources, others, unit) {
   const before = new Map((others || []).map((source) => [source.name, source.values]));
   const most = Math.max(1e-12, ...sources.map((source) => source.values), ...before.values());
   return [...sources].sort((a, b) => b.values - a.values).map((source) => {
-    const row = make("li"), bar = make("i"), was = before.get(source.name), track = make("span", undefined, "track");
+    const bar = make("i", undefined, source.is_temporal === false ? "fixed" : {}), was = before.get(source.name);
+    const track = around("span", "track", bar), name = source.label || source.name.replaceAll("_", " ");
     bar.style.width = (100 * source.values) / most + "%";
-    bar.classList.toggle("fixed", source.is_temporal === false);
-    track.append(bar);
     if (was !== undefined) {
-      const mark = make("b");
+      const mark = make("b", undefined, { title: "A: " + quantity(was, unit, 3) });
       mark.style.left = (100 * was) / most + "%";
-      mark.title = "A: " + quantity(was, unit, 3);
       track.append(mark);
     }
-    row.append(make("span", source.label || source.name.replaceAll("_", " ")), track, make("span", quantity(source.values, unit, 3)));
-    return row;
+    return around("li", {}, make("span", name), track, make("span", quantity(source.values, unit, 3)));
   });
 }

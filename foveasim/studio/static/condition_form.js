@@ -1,27 +1,12 @@
 // Forms of a result with the photosites it is of, and of a requirement, which limits one.
 
-import { make } from "/web/page_parts.js";
+import { around } from "/web/page_parts.js";
+import { fieldOf, selectOf } from "./elements.js";
 import { numberOf } from "./numbers.js";
 
 const REGIONS = [["all", "all photosites"], ["site", "pinned photosite"], ["rectangle", "selected rectangle"],
   ["annulus", "annulus around the centre"]];
 const LIMITS = [["at_least", "at least"], ["at_most", "at most"], ["equal", "equals"]];
-
-/** @type {(choices: string[][], label: string) => HTMLSelectElement} */
-export function selectOf(choices, label) {
-  const select = make("select");
-  select.setAttribute("aria-label", label);
-  for (const [value, text] of choices) select.append(new Option(text, value));
-  return select;
-}
-
-/** @type {(label: string, placeholder: string) => HTMLInputElement} */
-export function fieldOf(label, placeholder) {
-  const field = make("input");
-  Object.assign(field, { type: "text", placeholder, autocomplete: "off", spellcheck: false });
-  field.setAttribute("aria-label", label);
-  return field;
-}
 
 // The number in a field; an error explains what is missing.
 /** @type {(field: HTMLInputElement, what: string, unit: string) => number} */
@@ -29,6 +14,12 @@ export function readNumber(field, what, unit) {
   const found = numberOf(field.value, unit);
   if (!Number.isFinite(found)) throw new Error("Enter " + what + " as a number");
   return found;
+}
+
+// What a function returns, or { problem } where it throws an error that explains what is missing.
+/** @type {(read: () => { [name: string]: any }) => { [name: string]: any }} */
+export function orProblem(read) {
+  try { return read(); } catch (error) { return { problem: error instanceof Error ? error.message : String(error) }; }
 }
 
 export class ResultForm {
@@ -39,11 +30,10 @@ export class ResultForm {
     this.measures = [];
     this.measure = selectOf(none === undefined ? [] : [["", none]], "Result");
     this.region = selectOf(REGIONS, "Photosites");
-    this.inner = fieldOf("Inner radius, µm", "from / µm");
-    this.outer = fieldOf("Outer radius, µm", "to / µm");
-    this.frequency = fieldOf("Spatial frequency, per mm", "1/mm");
-    this.root = make("div", undefined, "condition");
-    this.root.append(this.measure, this.frequency, this.region, this.inner, this.outer);
+    this.inner = fieldOf("Inner radius, µm", { placeholder: "from / µm" });
+    this.outer = fieldOf("Outer radius, µm", { placeholder: "to / µm" });
+    this.frequency = fieldOf("Spatial frequency, per mm", { placeholder: "1/mm" });
+    this.root = around("div", "condition", this.measure, this.frequency, this.region, this.inner, this.outer);
     for (const select of [this.measure, this.region]) select.addEventListener("change", () => this._show());
     this._show();
   }
@@ -96,19 +86,17 @@ export class ConditionForm extends ResultForm {
   constructor(page) {
     super(page);
     this.limit = selectOf(LIMITS, "Condition");
-    this.value = fieldOf("Value", "value");
+    this.value = fieldOf("Value", { placeholder: "value" });
     this.root.append(this.limit, this.value);
   }
 
   // Returns { requirement } as in settings, or { problem }.
   read() {
-    try {
+    return orProblem(() => {
       const value = readNumber(this.value, "the value", this.about?.unit ?? ""), requirement = { ...this.readResult() };
       if (this.limit.value !== "at_most") requirement.at_least = value;
       if (this.limit.value !== "at_least") requirement.at_most = value;
       return { requirement };
-    } catch (error) {
-      return { problem: error instanceof Error ? error.message : String(error) };
-    }
+    });
   }
 }

@@ -1,5 +1,6 @@
 // Connection to the server: one WebSocket that reconnects, messages with numbers, and parts with arrays.
 
+import { memory } from "./memory.js";
 import { awaited } from "./pending.js";
 import { WorkerSocket } from "./worker_socket.js";
 
@@ -15,14 +16,6 @@ const WRONG_TOKEN = 4403;
 const PATIENCE_MS = 4000;
 // Without any message for this time after a change, the server does not answer.
 const SILENT_MS = 1500;
-
-// What the page remembers in this tab, such as its session.
-export const memory = {
-  /** @param {string} name */
-  get(name) { try { return sessionStorage.getItem("foveasim-studio-" + name); } catch { return null; } },
-  /** @param {string} name @param {string} text */
-  set(name, text) { try { sessionStorage.setItem("foveasim-studio-" + name, text); } catch { /* not kept */ } },
-};
 
 // Identifies this page: a duplicated tab remembers the same session, and receives a copy of it; a reloaded one keeps the session.
 const PAGE = (isReloaded() && memory.get("page"))
@@ -280,34 +273,34 @@ export class Connection {
 
   get headers() { return { Authorization: "Bearer " + this.token, "X-Session": memory.get("session") || "" }; }
 
-  // Sends a file to the server; returns { path } or { error }.
-  /** @type {(file: File) => Promise<{ path?: string, error?: string }>} */
-  upload(file) { return awaited(this._upload(file)); }
-
-  /** @type {(file: File) => Promise<{ path?: string, error?: string }>} */
-  async _upload(file) {
+  // Requests an address of the server; returns what read(answer) finds in the answer, or { error }, by default with the problem.
+  /** @typedef {{ error: string }} Problem */
+  /** @type {<T>(address: string, problem: string, read: (answer: Response) => Promise<T>, options?: object) => Promise<T | Problem>} */
+  async _request(address, problem, read, options) {
     try {
-      const answer = await fetch("/file?name=" + encodeURIComponent(file.name), { method: "POST", headers: this.headers, body: file });
-      const found = await answer.json().catch(() => ({}));
-      return answer.ok || found.error ? found : { error: "The server does not accept " + file.name + " (status " + answer.status + ")" };
+      const answer = await fetch(address, { headers: this.headers, ...options });
+      if (answer.ok) return await read(answer);
+      const { error } = await answer.json().catch(() => ({}));
+      return { error: error || problem + " (status " + answer.status + ")" };
     } catch {
       return { error: "The server does not answer" };
     }
+  }
+
+  // Sends a file to the server; returns { path } or { error }.
+  /** @type {(file: File) => Promise<{ path?: string, error?: string }>} */
+  upload(file) {
+    return awaited(this._request("/file?name=" + encodeURIComponent(file.name), "The server does not accept " + file.name,
+      (answer) => answer.json().catch(() => ({})), { method: "POST", body: file }));
   }
 
   // Returns the file of the current state as { blob } or { error }.
   /** @type {(what: string) => Promise<{ blob?: Blob, error?: string }>} */
-  fetchFile(what) { return awaited(this._fetchFile(what)); }
-
-  /** @type {(what: string) => Promise<{ blob?: Blob, error?: string }>} */
-  async _fetchFile(what) {
-    try {
-      const answer = await fetch("/download?what=" + what, { headers: this.headers });
-      if (answer.ok) return { blob: await answer.blob() };
-      const found = await answer.json().catch(() => ({}));
-      return { error: found.error || "The file is not available (status " + answer.status + ")" };
-    } catch {
-      return { error: "The server does not answer" };
-    }
+  fetchFile(what) {
+    return awaited(this._request("/download?what=" + what, "The file is not available", async (answer) => ({ blob: await answer.blob() })));
   }
+
+  // Returns the contents of the start page, or { error }.
+  /** @type {() => Promise<StartContents | Problem>} */
+  fetchStart() { return awaited(this._request("/start", "The start page is not available", (answer) => answer.json())); }
 }

@@ -1,7 +1,8 @@
 // Controls of all settings, generated from the list of the server: sliders, fields, choices, with errors and resets.
 
 import { clamp, roundStep, shown } from "/web/colours.js";
-import { change, make } from "/web/page_parts.js";
+import { around, change, make } from "/web/page_parts.js";
+import { buttonOf, fieldOf } from "./elements.js";
 import { numberOf, unitText } from "./numbers.js";
 
 // Sections that are open at first; settings outside all sections are in the first of them.
@@ -121,29 +122,18 @@ class Row {
     this.root.dataset.id = control.id || control.key;
     this.root.style.setProperty("--depth", String(Math.max(0, control.key.split(".").length - 2 + (control.is_value ? 1 : 0))));
     // Names of controls and their help for screen readers; the page shows the help of the focused control.
-    this.help = make("span", control.help || "", "unseen");
-    this.help.id = this.id + "-help";
+    this.help = make("span", control.help || "", { className: "unseen", id: this.id + "-help" });
     this.name = control.label + (control.is_value ? ", value" : "") + (control.context ? ", " + control.context : "");
-    this.label = make("label", control.is_value ? "value" : control.label);
-    this.label.htmlFor = this.id;
-    this.reset = make("button", "↺", "reset");
-    this.reset.type = "button";
-    this.reset.title = "Reset to the value at the start";
-    this.reset.setAttribute("aria-label", "Reset " + this.name);
-    this.reset.hidden = true;
-    this.reset.addEventListener("click", () => { this.field?.focus(); on.reset(); });
-    this.error = make("p", undefined, "error");
-    this.error.id = this.id + "-error";
-    this.error.hidden = true;
+    this.label = make("label", control.is_value ? "value" : control.label, { htmlFor: this.id });
+    this.reset = buttonOf("↺", () => { this.field?.focus(); on.reset(); },
+      { className: "reset", title: "Reset to the value at the start", ariaLabel: "Reset " + this.name, hidden: true });
+    this.error = make("p", undefined, { className: "error", id: this.id + "-error", hidden: true });
     this.unit = make("span", unitText(control.unit || ""), "unit");
     if (control.kind === "group") this._buildHeading();
     else if (control.kind === "sections") this._buildAdder();
     else this._build();
-    for (const input of [this.field, this.slider]) {
-      if (!input) continue;
-      input.setAttribute("aria-describedby", this.help.id + " " + this.error.id);
-    }
-    this.field?.setAttribute("aria-label", this.name + (control.unit ? ", " + control.unit : ""));
+    for (const input of [this.field, this.slider]) input?.setAttribute("aria-describedby", this.help.id + " " + this.error.id);
+    if (this.field) this.field.ariaLabel = this.name + (control.unit ? ", " + control.unit : "");
     this.adder?.setAttribute("aria-describedby", this.help.id);
     this.root.append(this.help, this.error);
     const plain = (...texts) => texts.join(" ").toLowerCase().replaceAll("_", " ");
@@ -156,26 +146,20 @@ class Row {
     if (kind === "choice") {
       const field = make("select");
       this.choices = choicesOf(control);
-      this.choices.forEach(({ label, value, file }, i) => {
-        const option = make("option", String(label ?? fieldText(value)).replaceAll("_", " ") + (file ? "…" : ""));
-        option.value = String(i);
-        field.append(option);
-      });
+      field.append(...this.choices.map(({ label, value, file }, i) =>
+        new Option(String(label ?? fieldText(value)).replaceAll("_", " ") + (file ? "…" : ""), String(i))));
       field.addEventListener("change", () => {
         const choice = this.choices[Number(field.value)];
         if (choice) this._choose(choice, (value) => value);
       });
       return field;
     }
-    const field = make("input");
     if (kind === "boolean") {
-      field.type = "checkbox";
-      field.addEventListener("change", () => this._send(field.checked, true));
-      return field;
+      const box = make("input", undefined, { type: "checkbox" });
+      box.addEventListener("change", () => this._send(box.checked, true));
+      return box;
     }
-    field.type = "text";
-    field.autocomplete = "off";
-    field.spellcheck = false;
+    const field = fieldOf("");
     if (kind === "number" || kind === "integer") field.inputMode = "decimal";
     field.addEventListener("input", () => { this.isDirty = true; this.isCurrent = false; });
     field.addEventListener("change", () => this._commit(field));
@@ -202,34 +186,24 @@ class Row {
   }
 
   _build() {
-    const field = this._makeField(), line = make("div", undefined, "line"), { kind } = this.control;
+    const field = this._makeField(), { kind } = this.control;
     this.field = field;
     field.id = this.id;
-    line.append(this.label, this.reset, field, kind === "file" ? this._fileButton() : this.unit);
-    this.root.append(line);
+    this.root.append(around("div", "line", this.label, this.reset, field, kind === "file" ? this._fileButton() : this.unit));
     if (kind === "number" || kind === "integer") this._buildSlider(field);
   }
 
   _fileButton() {
-    const button = make("button", "…", "choose");
-    button.type = "button";
-    button.title = "Choose a file";
-    button.setAttribute("aria-label", "Choose a file for " + this.name);
-    button.addEventListener("click", async () => {
+    return buttonOf("…", async () => {
       const path = await this.on.chooseFile();
       if (path) this._send(path, true);
-    });
-    return button;
+    }, { className: "choose", title: "Choose a file", ariaLabel: "Choose a file for " + this.name });
   }
 
   _buildSlider(field) {
     if (!sliderOf(this.control, NaN)) return;
-    const slider = make("input");
+    const slider = make("input", undefined, { type: "range", min: "0", step: "1", ariaLabel: this.name + " slider" });
     this.slider = slider;
-    slider.type = "range";
-    slider.min = "0";
-    slider.step = "1";
-    slider.setAttribute("aria-label", this.name + " slider");
     const value = () => this.range.toValue(Number(slider.value));
     const release = () => {
       if (!this.isHeld) return;
@@ -254,33 +228,21 @@ class Row {
   _buildHeading() {
     const { control } = this, heading = make("h3", control.label);
     this.root.append(heading);
-    if (!control.is_item) return;
-    const remove = make("button", "✕", "remove");
-    remove.type = "button";
-    remove.title = "Remove";
-    remove.setAttribute("aria-label", "Remove " + control.label);
-    remove.addEventListener("click", () => this.on.remove());
-    heading.append(remove);
+    if (control.is_item) heading.append(buttonOf("✕", () => this.on.remove(),
+      { className: "remove", title: "Remove", ariaLabel: "Remove " + control.label }));
   }
 
   // A list of sections, to which the user adds one.
   _buildAdder() {
-    const adder = make("select");
-    adder.id = this.id;
+    const adder = make("select", undefined, { id: this.id });
     this.choices = choicesOf(this.control);
-    ["Add…", ...this.choices.map(({ label, file }) => label + (file ? "…" : ""))].forEach((text, i) => {
-      const option = make("option", text);
-      option.value = String(i - 1);
-      adder.append(option);
-    });
+    adder.append(new Option("Add…", "-1"), ...this.choices.map(({ label, file }, i) => new Option(label + (file ? "…" : ""), String(i))));
     adder.addEventListener("change", () => {
       const choice = this.choices[Number(adder.value)];
       adder.value = "-1";
       if (choice) this._choose(choice, (value) => [...(this.value || []), value]);
     });
-    const line = make("div", undefined, "line");
-    line.append(this.label, this.reset, adder, this.unit);
-    this.root.append(line);
+    this.root.append(around("div", "line", this.label, this.reset, adder, this.unit));
     this.adder = adder;
   }
 
@@ -366,8 +328,7 @@ class Row {
     this.reset.hidden = !isChanged;
     this.error.hidden = !error;
     this.error.textContent = error || "";
-    if (error) this.field?.setAttribute("aria-invalid", "true");
-    else this.field?.removeAttribute("aria-invalid");
+    if (this.field) this.field.ariaInvalid = error ? "true" : null;
     this.value = value;
     // Settings that are absent and may be are behind a button.
     this.isExtra = Boolean(this.control.is_optional) && !this.control.is_value && this.control.kind !== "group"
@@ -489,14 +450,10 @@ export class Controls {
   _fillSection(name, rows) {
     let section = this.sections.get(name);
     if (!section) {
-      const root = make("details", undefined, "section"), heading = make("summary"), count = make("span", "", "count");
-      const body = make("div", undefined, "body");
-      heading.append(make("span", name.replaceAll("_", " ")), count);
-      const more = make("button", "", "more");
-      more.type = "button";
-      more.addEventListener("click", () => { section.isFull = !section.isFull; this._filter(); });
-      root.append(heading, body, more);
-      root.open = OPEN.includes(name);
+      const count = make("span", "", "count"), body = make("div", undefined, "body");
+      const heading = around("summary", {}, make("span", name.replaceAll("_", " ")), count);
+      const more = buttonOf("", () => { section.isFull = !section.isFull; this._filter(); }, { className: "more" });
+      const root = around("details", { className: "section", open: OPEN.includes(name) }, heading, body, more);
       root.dataset.section = name;
       section = { root, body, count, more, wasOpen: null, isFull: false };
       this.sections.set(name, section);

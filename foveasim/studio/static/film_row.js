@@ -1,6 +1,7 @@
 // The row under the bar of the optical image that plays videos, folders and the gaze path: step, play, time.
 
 import { change, make } from "/web/page_parts.js";
+import { buttonOf } from "./elements.js";
 
 // What has a part of the row, to which its own elements belong: names of the buttons and the slider; its film, null for none now;
 // words of its position, also for screen readers, and a problem instead; started() is called before it plays.
@@ -9,27 +10,15 @@ import { change, make } from "/web/page_parts.js";
  *   film: () => Film | null, words: () => string, problem?: () => string, started: () => void }} Player
  */
 
-/** @type {(text: string, title: string, act: () => void) => HTMLButtonElement} */
-export function rowButton(text, title, act) {
-  const button = make("button", text);
-  Object.assign(button, { type: "button", title });
-  button.setAttribute("aria-label", title || text);
-  button.addEventListener("click", act);
-  return button;
-}
-
 export class Transport {
   /** @type {Player[]} */ players = [];
 
   constructor() {
-    this.root = make("div", undefined, "film");
-    this.root.id = "transport";
-    this.root.hidden = true;
-    this.back = rowButton("◂", "", () => this.film?.step(-1));
-    this.play = rowButton("▶", "", () => this.toggle());
-    this.forward = rowButton("▸", "", () => this.film?.step(1));
-    this.slider = make("input");
-    Object.assign(this.slider, { type: "range", min: 0, step: 1, value: 0 });
+    this.root = make("div", undefined, { className: "film", id: "transport", hidden: true });
+    this.back = buttonOf("◂", () => this.film?.step(-1));
+    this.play = buttonOf("▶", () => this.toggle());
+    this.forward = buttonOf("▸", () => this.film?.step(1));
+    this.slider = make("input", undefined, { type: "range", min: "0", step: "1", value: "0" });
     this.slider.addEventListener("input", () => { this.film?.go(Number(this.slider.value), false); this.film?.pause(); });
     this.slider.addEventListener("change", () => this.film?.go(Number(this.slider.value), true));
     this.label = make("span", undefined, "quiet");
@@ -71,14 +60,10 @@ export class Transport {
     slider.max = String(last);
     if (!film || film.isPlaying || !film.isBusy) slider.value = String(n);
     const playing = film?.isPlaying ? names.pause : names.play;
-    for (const [element, name] of /** @type {[HTMLElement, string][]} */ ([[back, names.back], [play, playing],
-      [forward, names.forward]])) {
-      change(element, { title: name, ariaLabel: name });
-    }
     change(slider, { ariaLabel: names.slider, ariaValueText: words, disabled: last < 1 });
-    change(play, { textContent: film?.isPlaying ? "❚❚" : "▶", disabled: last < 1 });
-    change(back, { disabled: n <= 0 });
-    change(forward, { disabled: n >= last });
+    change(play, { textContent: film?.isPlaying ? "❚❚" : "▶", title: playing, ariaLabel: playing, disabled: last < 1 });
+    change(back, { title: names.back, ariaLabel: names.back, disabled: n <= 0 });
+    change(forward, { title: names.forward, ariaLabel: names.forward, disabled: n >= last });
     for (const each of [back, play, forward, slider]) each.hidden = !film && open.every((one) => one.part.id === "film");
     change(label, { textContent: words, title: words, className: problem ? "quiet wrong" : "quiet" });
   }

@@ -1,13 +1,13 @@
 // Gaze path: a row under the bar of the optical image to record, replay and edit it, and its files.
 
 import { clamp } from "/web/colours.js";
-import { change, download, find, make, notice, speak } from "/web/page_parts.js";
+import { $, change, download, find, make, notice, speak } from "/web/page_parts.js";
+import { buttonOf, titledButton } from "./elements.js";
 import { Film } from "./film.js";
-import { rowButton } from "./film_row.js";
 import { GazeMarks } from "./gaze_marks.js";
 import { Recording, withChanged, withRow } from "./gaze_rows.js";
 import { GazeTable } from "./gaze_table.js";
-import { listenToMenu } from "./menus.js";
+import { menuOf } from "./menus.js";
 import { numberOf } from "./numbers.js";
 
 /** @typedef {import("./gaze_rows.js").GazeRow} GazeRow */
@@ -17,22 +17,17 @@ const NAMES = { back: "One step back on the gaze path", play: "Play the gaze pat
   forward: "One step forward on the gaze path", slider: "Time on the gaze path" };
 // Interval in which the time of a recording is shown, in ms.
 const TICK_MS = 100;
-// Parameters of random paths: name, label, unit, value at first (for a video its duration).
-const SACCADES = [["duration_s", "Duration", "s", "5"], ["fixation_s", "Mean fixation", "s", "0.3"],
-  ["drift_um_per_root_s", "Drift after 1 s", "µm", "0"], ["seed", "Seed", "", "1"]];
 
 export class GazePanel {
   /** @type {GazeRow[]} */ rows = [];
   /** @type {Film | null} */ film = null;
   /** @type {Recording | null} */ recording = null;
   /** @type {FilmAbout | null} */ video = null;
-  /** @type {HTMLInputElement[]} */ fields = [];
   /** @type {{ of: Recording, n: number, rows: GazeRow[] } | null} */ recorded = null;
   // Elements.
   /** @type {HTMLElement} */ row;
   /** @type {{ [name: string]: HTMLButtonElement }} */ buttons;
   /** @type {HTMLInputElement} */ chosen;
-  /** @type {HTMLDialogElement} */ dialog;
   /** @type {number[] | null} */ timesS = null;
   pictureStep = 1; shortestStep = 1; problem = ""; error = ""; filmKey = ""; isKnown = false; timer = 0;
 
@@ -59,24 +54,24 @@ export class GazePanel {
     });
     this.buttons = {};
     this._build();
-    this._buildDialog();
+    $("saccades-form").addEventListener("submit", (event) => {
+      if (event.submitter?.getAttribute("value") === "create" && !this._create()) event.preventDefault();
+    });
   }
 
   // -- elements -------------------------------------------------------------------------------------------------------------
 
   _build() {
-    const toggle = rowButton("Gaze path", "", () => this.open(Boolean(this.row.hidden))), { on } = this;
-    toggle.id = "gaze-path";
-    toggle.title = "Record, replay and edit movements of the gaze";
-    find(this.root, "#follow-scene").before(toggle);
-    this.row = make("div");
-    this.row.id = "gaze";
-    this.row.setAttribute("role", "group");
-    this.row.setAttribute("aria-label", "Gaze path");
-    const record = rowButton("Record", "", () => (this.recording ? this.finish() : this.start()));
-    record.classList.add("record");
-    record.title = "Record movements of the gaze: drag the outline, or use the arrow keys on the optical image";
-    const table = rowButton("Rows", "Show the rows of the gaze path", () => {
+    const { on } = this, toggle = buttonOf("Gaze path", () => this.open(Boolean(this.row.hidden)), {
+      id: "gaze-path", ariaLabel: "Gaze path", title: "Record, replay and edit movements of the gaze",
+    });
+    $("follow-scene").before(toggle);
+    this.row = make("div", undefined, { id: "gaze", role: "group", ariaLabel: "Gaze path" });
+    const record = buttonOf("Record", () => (this.recording ? this.finish() : this.start()), {
+      className: "record", ariaLabel: "Record",
+      title: "Record movements of the gaze: drag the outline, or use the arrow keys on the optical image",
+    });
+    const table = titledButton("Rows", "Show the rows of the gaze path", () => {
       this.table.root.hidden = !this.table.root.hidden;
       this._show();
     });
@@ -89,61 +84,20 @@ export class GazePanel {
   }
 
   _menu() {
-    const frame = make("div", undefined, "menu-frame"), button = make("button", "Path "), menu = make("div", undefined, "menu right");
-    const arrow = make("span", "▾"), entry = (text, act) => {
-      const item = make("button", text);
-      item.type = "button";
-      item.addEventListener("click", act);
-      menu.append(item);
-      return item;
-    };
-    arrow.setAttribute("aria-hidden", "true");
-    button.type = "button";
-    button.id = "gaze-menu";
-    button.append(arrow);
-    menu.hidden = true;
-    this.chosen = make("input");
-    Object.assign(this.chosen, { type: "file", accept: ".csv,text/csv", className: "unseen", tabIndex: -1, id: "chosen-gaze" });
-    this.chosen.setAttribute("aria-label", "CSV file of a gaze path");
+    const { frame, menu } = menuOf("Path", { id: "gaze-menu" });
+    this.chosen = make("input", undefined, { type: "file", accept: ".csv,text/csv", className: "unseen", tabIndex: -1, id: "chosen-gaze",
+      ariaLabel: "CSV file of a gaze path" });
     this.chosen.addEventListener("change", () => {
       const file = this.chosen.files?.[0];
       if (file) this._openFile(file);
       this.chosen.value = "";
     });
-    entry("Saccades…", () => this._ask());
-    entry("Open CSV…", () => this.chosen.click());
-    this.buttons.save = entry("Save CSV", () => this._saveFile());
-    this.buttons.clear = entry("Clear", () => this._commit([]));
+    this.buttons.save = buttonOf("Save CSV", () => this._saveFile());
+    this.buttons.clear = buttonOf("Clear", () => this._commit([]));
+    menu.append(buttonOf("Saccades…", () => this._ask()), buttonOf("Open CSV…", () => this.chosen.click()), this.buttons.save,
+      this.buttons.clear);
     find(this.root, ".bar").append(this.chosen);
-    frame.append(button, menu);
-    listenToMenu(button, menu);
     return frame;
-  }
-
-  _buildDialog() {
-    const form = make("form"), title = make("h2", "Random gaze path of saccades");
-    const create = make("button", "Create"), cancel = make("button", "Cancel");
-    this.dialog = make("dialog");
-    this.dialog.id = "saccades-dialog";
-    title.id = "saccades-title";
-    this.dialog.setAttribute("aria-labelledby", title.id);
-    form.method = "dialog";
-    create.value = "create";
-    const lines = SACCADES.map(([name, label, unit, value]) => {
-      const line = make("label", label + (unit ? " / " + unit : "")), field = make("input");
-      Object.assign(field, { type: "text", name, value, autocomplete: "off", spellcheck: false });
-      this.fields.push(field);
-      line.append(field);
-      return line;
-    });
-    const buttons = make("div", undefined, "buttons");
-    buttons.append(create, " ", cancel);
-    form.append(...lines, make("p", "Targets lie where the image covers all photosites.", "quiet"), buttons);
-    form.addEventListener("submit", (event) => {
-      if (event.submitter === create && !this._create()) event.preventDefault();
-    });
-    this.dialog.append(title, form);
-    document.body.append(this.dialog);
   }
 
   // -- state ----------------------------------------------------------------------------------------------------------------
@@ -301,21 +255,20 @@ export class GazePanel {
     else notice(error || "The file is not available");
   }
 
+  // Asks for the parameters of a random path; its duration is that of a video.
   _ask() {
-    const duration = this.fields.find(({ name }) => name === "duration_s");
-    if (duration && this.video?.n_frames) {
+    if (this.video?.n_frames) {
       const seconds = (this.timesS?.at(-1) ?? (this.video.n_frames - 1) * this.step) + this.step;
-      duration.value = String(Number(seconds.toPrecision(6)));
+      $("saccades-duration").value = String(Number(seconds.toPrecision(6)));
     }
-    this.dialog.showModal();
+    $("saccades-dialog").showModal();
   }
 
   // Asks the server for a random path; returns whether all fields are numbers.
   _create() {
-    const values = this.fields.map((field, k) => {
-      const value = numberOf(field.value, SACCADES[k][2]);
-      if (Number.isFinite(value)) field.removeAttribute("aria-invalid");
-      else field.setAttribute("aria-invalid", "true");
+    const values = [...$("saccades-form").querySelectorAll("input")].map((field) => {
+      const value = numberOf(field.value, field.dataset.unit);
+      field.ariaInvalid = Number.isFinite(value) ? null : "true";
       return [field.name, value];
     });
     if (!values.every(([, value]) => Number.isFinite(value))) return false;

@@ -1,7 +1,7 @@
 // Table of the rows of a gaze path: fields, deletion, and the row of the present time.
 
-import { make } from "/web/page_parts.js";
-import { rowButton } from "./film_row.js";
+import { around, make } from "/web/page_parts.js";
+import { fieldOf, titledButton } from "./elements.js";
 import { rowAt } from "./gaze_rows.js";
 import { numberOf } from "./numbers.js";
 
@@ -21,29 +21,16 @@ export class GazeTable {
   /** @param {{ changed: (index: number, row: GazeRow) => void, removed: (index: number) => void, inserted: () => void }} on */
   constructor(on) {
     this.on = on;
-    this.root = make("div", undefined, "gaze-table");
-    this.root.id = "gaze-table";
-    this.root.setAttribute("role", "group");
-    this.root.setAttribute("aria-label", "Rows of the gaze path");
-    this.insert = rowButton("Insert", "Insert the present gaze at the present time", () => this.on.inserted());
-    this.earlier = rowButton("◂", "Earlier rows", () => this._turn(-MOST_ROWS));
-    this.later = rowButton("▸", "Later rows", () => this._turn(MOST_ROWS));
+    this.root = make("div", undefined, { className: "gaze-table", id: "gaze-table", role: "group", ariaLabel: "Rows of the gaze path" });
+    this.insert = titledButton("Insert", "Insert the present gaze at the present time", () => this.on.inserted());
+    this.earlier = titledButton("◂", "Earlier rows", () => this._turn(-MOST_ROWS));
+    this.later = titledButton("▸", "Later rows", () => this._turn(MOST_ROWS));
     this.note = make("span", undefined, "quiet");
-    const head = make("div", undefined, "gaze-head"), scroller = make("div", undefined, "gaze-rows");
-    const table = make("table"), titles = make("tr");
-    head.append(this.insert, this.note, this.earlier, this.later);
-    for (const [name, unit] of COLUMNS) {
-      const title = make("th", name + "\u00a0/\u00a0" + unit);
-      title.scope = "col";
-      titles.append(title);
-    }
-    titles.append(make("td"));
+    const titles = COLUMNS.map(([name, unit]) => make("th", name + "\u00a0/\u00a0" + unit, { scope: "col" }));
+    const heading = around("thead", {}, around("tr", {}, ...titles, make("td")));
     this.body = make("tbody");
-    const heading = make("thead");
-    heading.append(titles);
-    table.append(heading, this.body);
-    scroller.append(table);
-    this.root.append(head, scroller);
+    this.root.append(around("div", "gaze-head", this.insert, this.note, this.earlier, this.later),
+      around("div", "gaze-rows", around("table", {}, heading, this.body)));
   }
 
   // Shows rows; those at the present time are marked, and shown first if the time has changed.
@@ -86,15 +73,11 @@ export class GazeTable {
   _newRow(i) {
     const line = make("tr");
     COLUMNS.forEach((_, column) => {
-      const field = make("input"), cell = make("td");
-      Object.assign(field, { type: "text", inputMode: "decimal", autocomplete: "off", spellcheck: false });
+      const field = fieldOf("", { inputMode: "decimal" });
       field.addEventListener("change", () => this._change(this.first + i, column, field));
-      cell.append(field);
-      line.append(cell);
+      line.append(around("td", {}, field));
     });
-    const cell = make("td");
-    cell.append(rowButton("✕", "Delete", () => { this.on.removed(this.first + i); }));
-    line.append(cell);
+    line.append(around("td", {}, titledButton("✕", "Delete", () => { this.on.removed(this.first + i); })));
     return line;
   }
 
@@ -102,19 +85,15 @@ export class GazeTable {
   _fill(line, index, row) {
     line.querySelectorAll("input").forEach((field, column) => {
       const [name, unit, decimals] = COLUMNS[column], text = String(Number(row[column].toFixed(decimals)));
-      field.setAttribute("aria-label", name + " of row " + (index + 1) + ", " + unit);
+      field.ariaLabel = name + " of row " + (index + 1) + ", " + unit;
       // A text that is being typed stays.
       if (field !== document.activeElement || field.dataset.text !== text) field.value = text;
       field.dataset.text = text;
       field.removeAttribute("aria-invalid");
     });
     const button = line.querySelector("button");
-    if (button) {
-      button.title = "Delete row " + (index + 1);
-      button.setAttribute("aria-label", button.title);
-    }
-    if (index === this.current) line.setAttribute("aria-current", "true");
-    else line.removeAttribute("aria-current");
+    if (button) button.title = button.ariaLabel = "Delete row " + (index + 1);
+    line.ariaCurrent = index === this.current ? "true" : null;
   }
 
   /** @param {number} index @param {number} column @param {HTMLInputElement} field */

@@ -18,12 +18,8 @@ export class ImagePane {
     this.on = on;
     this.mapOf = mapOf;
     this.canMove = canMove;
-    this.image = make("canvas", undefined, "image");
-    this.marks = make("canvas", undefined, "marks");
-    this.marks.tabIndex = 0;
-    this.marks.setAttribute("role", "application");
-    this.marks.setAttribute("aria-label", label);
-    this.image.setAttribute("aria-hidden", "true");
+    this.image = make("canvas", undefined, { className: "image", ariaHidden: "true" });
+    this.marks = make("canvas", undefined, { className: "marks", tabIndex: 0, role: "application", ariaLabel: label });
     root.append(this.image, this.marks);
     this.pixels = make("canvas");
     /** @type {number[] | null} */

@@ -1,6 +1,7 @@
 // Menus that open from a button, and dialogs with a text.
 
-import { $, make, notice } from "/web/page_parts.js";
+import { $, around, closeOutside, make, notice } from "/web/page_parts.js";
+import { buttonOf } from "./elements.js";
 
 // A menu of buttons: arrows move, Escape and clicks outside close it.
 export function listenToMenu(button, menu) {
@@ -26,6 +27,15 @@ export function listenToMenu(button, menu) {
   menu.addEventListener("focusout", (event) => {
     if (event.relatedTarget && !menu.contains(event.relatedTarget) && event.relatedTarget !== button) show(false);
   });
+}
+
+// A button that opens a menu, which ends at its right, after fill().
+/** @param {string} text @param {Partial<HTMLButtonElement>} about */
+export function menuOf(text, about, fill = () => {}) {
+  const button = buttonOf(text + " ", fill, about), menu = make("div", undefined, { className: "menu right", hidden: true });
+  button.append(make("span", "▾", { ariaHidden: "true" }));
+  listenToMenu(button, menu);
+  return { menu, frame: around("div", "menu-frame", button, menu) };
 }
 
 export async function copyText(text, what) {
@@ -78,10 +88,5 @@ export function listenToDialogs() {
     }
     setTimeout(() => { $("text-copy").textContent = "Copy"; }, 1500);
   });
-  for (const dialog of document.querySelectorAll("dialog")) {
-    dialog.addEventListener("click", (event) => {
-      const box = dialog.getBoundingClientRect(), { clientX: x, clientY: y } = event;
-      if (event.target === dialog && (x < box.left || x > box.right || y < box.top || y > box.bottom)) dialog.close();
-    });
-  }
+  document.querySelectorAll("dialog").forEach(closeOutside);
 }

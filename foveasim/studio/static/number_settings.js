@@ -1,7 +1,7 @@
 // Settings that are numbers, for forms that change one or two of them.
 
-import { make } from "/web/page_parts.js";
 import { valueAt } from "./controls.js";
+import { selectOf } from "./elements.js";
 
 // Positive ranges from this ratio of their ends are logarithmic.
 const WIDE_RATIO = 50;
@@ -42,8 +42,7 @@ export class SettingSelect {
     this.none = none;
     this.without = without;
     this.wanted = none === undefined ? wanted : "";
-    this.root = make("select");
-    this.root.setAttribute("aria-label", label);
+    this.root = selectOf([], label);
   }
 
   get control() { return this.rows.get(this.root.value)?.control; }

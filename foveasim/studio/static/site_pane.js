@@ -7,7 +7,7 @@ import { drawRamp, kindsOf, swatchItem, tickLabels, titleOf } from "/web/legend.
 import { SensorMap } from "/web/map.js";
 import { drawCross, drawOutlines, drawSelected, drawTrace, ringSites } from "/web/marks.js";
 import { Overview } from "/web/overview.js";
-import { change, inkOf, make } from "/web/page_parts.js";
+import { around, change, inkOf, make } from "/web/page_parts.js";
 import { sitesIn } from "/web/measure.js";
 import { sizeOf } from "./frames.js";
 import { RasterMap } from "./raster_map.js";
@@ -51,27 +51,17 @@ export class SitePane {
   constructor(root, on, { renderer, label }) {
     this.root = root;
     this.renderer = renderer;
-    const layer = (name) => {
-      const canvas = make("canvas", undefined, name);
-      canvas.setAttribute("aria-hidden", "true");
-      root.append(canvas);
-      return canvas;
-    };
+    const layer = (className) => make("canvas", undefined, { className, ariaHidden: "true" });
     this.cells = layer("cells");
     this.overviewCanvas = layer("overview");
     this.lines = layer("lines");
-    this.marks = layer("marks");
-    this.marks.removeAttribute("aria-hidden");
-    this.marks.tabIndex = 0;
-    this.marks.setAttribute("role", "application");
-    this.marks.setAttribute("aria-label", label);
-    this.legend = make("div", undefined, "legend");
+    this.marks = make("canvas", undefined, { className: "marks", tabIndex: 0, role: "application", ariaLabel: label });
     this.title = make("p", "", "legend-title");
     this.ramp = make("canvas");
     this.ticks = make("div", undefined, "ticks");
     this.kinds = make("ul");
-    this.legend.append(this.title, this.ramp, this.ticks, this.kinds);
-    root.append(this.legend);
+    this.legend = around("div", "legend", this.title, this.ramp, this.ticks, this.kinds);
+    root.append(this.cells, this.overviewCanvas, this.lines, this.marks, this.legend);
     /** @type {Point} */
     let held = [0, 0];
     listenToPointers(this.marks, {
@@ -262,10 +252,7 @@ export class SitePane {
     if (isAt) drawCross(context, map.toX(cursor.x), map.toY(cursor.y));
   }
 
-  pick(x, y) {
-    const all = this.sites ? this.sites.pickAll(x, y) : [];
-    return all.length ? all[all.length - 1] : -1;
-  }
+  pick(x, y) { return this.sites?.pick(x, y) ?? -1; }
 
   sitesIn(rectangle) { return this.sites ? sitesIn(this.sites, rectangle) : []; }
 }

@@ -2,9 +2,9 @@
 
 import { $, make, notice } from "/web/page_parts.js";
 import { Camera, FIRST_SIZE, SIZES } from "./camera.js";
+import { buttonOf, selectOf, titledButton } from "./elements.js";
 import { Film, Rate } from "./film.js";
-import { rowButton } from "./film_row.js";
-import { listenToMenu } from "./menus.js";
+import { menuOf } from "./menus.js";
 import { awaited } from "./pending.js";
 
 const VIDEO = /\.(mp4|m4v|mov|avi|mkv|webm|mpe?g|ogv|wmv|gif)$/i;
@@ -12,6 +12,7 @@ const PICTURE = /\.(bmp|exr|hdr|jp2|jpe?g|png|ppm|tga|tiff?|webp)$/i;
 // Pictures that browsers can show.
 const SHOWN = /\.(bmp|jpe?g|png|webp)$/i;
 const MAX_PICTURES = 500;
+const STOP = "Stop the camera; its last frame stays the scene";
 const NAMES = { back: "One frame back", play: "Play", pause: "Pause", forward: "One frame forward", slider: "Frame" };
 
 export const isVideo = (name) => VIDEO.test(name);
@@ -46,49 +47,28 @@ export class Sources {
   // -- elements -------------------------------------------------------------------------------------------------------------
 
   _build() {
-    const bar = this.pane.querySelector(".bar"), frame = make("div", undefined, "menu-frame"), button = make("button", "Source ");
-    const arrow = make("span", "▾");
-    button.type = "button";
-    button.id = "source";
-    button.title = "Photograph, video, folder, camera or test chart as the scene";
-    arrow.setAttribute("aria-hidden", "true");
-    button.append(arrow);
-    this.menu = make("div", undefined, "menu right");
+    const title = "Photograph, video, folder, camera or test chart as the scene";
+    const { frame, menu } = menuOf("Source", { id: "source", title }, () => this._fillMenu());
+    this.menu = menu;
     this.menu.id = "source-menu";
-    this.menu.hidden = true;
-    this.directory = make("input");
-    Object.assign(this.directory, { type: "file", webkitdirectory: true, multiple: true, className: "unseen", tabIndex: -1,
-      id: "chosen-folder" });
-    this.directory.setAttribute("aria-label", "Folder of pictures");
-    frame.append(button, this.menu, this.directory);
-    bar.insertBefore(frame, $("follow-scene"));
-    this.row = make("div");
-    this.row.id = "film";
-    this.strip = make("div", undefined, "strip");
-    this.strip.id = "strip";
-    this.strip.hidden = true;
-    this.strip.setAttribute("role", "group");
-    this.strip.setAttribute("aria-label", "Pictures of the folder");
-    bar.after(this.transport.root, this.strip);
+    this.directory = make("input", undefined, { type: "file", webkitdirectory: true, multiple: true, className: "unseen", tabIndex: -1,
+      id: "chosen-folder", ariaLabel: "Folder of pictures" });
+    frame.append(this.directory);
+    $("follow-scene").before(frame);
+    this.row = make("div", undefined, { id: "film" });
+    this.strip = make("div", undefined, { className: "strip", id: "strip", hidden: true, role: "group",
+      ariaLabel: "Pictures of the folder" });
+    this.pane.querySelector(".bar").after(this.transport.root, this.strip);
     this.buttons = {
-      close: rowButton("✕", "Close", () => this._close()),
-      camera: rowButton("Stop", "Stop the camera; its last frame stays the scene",
-        () => (this.camera.isOn ? this.stopCamera() : this.startCamera())),
+      close: titledButton("✕", "Close", () => this._close()),
+      camera: titledButton("Stop", STOP, () => this._switchCamera()),
     };
-    this.size = make("select");
-    this.size.setAttribute("aria-label", "Longer side of camera frames");
-    this.size.append(...SIZES.map((size) => { return new Option(size + " px", String(size)); }));
+    this.size = selectOf(SIZES.map((size) => [String(size), size + " px"]), "Longer side of camera frames");
     this.size.value = String(FIRST_SIZE);
     this.size.addEventListener("change", () => { this.camera.size = Number(this.size.value); });
     this.row.append(this.buttons.camera, this.size, this.buttons.close);
     this.transport.add({ names: NAMES, part: this.row, film: () => (this._isCamera ? null : this.film), words: () => this._words(),
       started: () => this.on.playing() });
-    button.addEventListener("click", () => this._fillMenu());
-    listenToMenu(button, this.menu);
-    this.menu.addEventListener("click", (event) => {
-      const chosen = /** @type {Element} */ (event.target).closest("button");
-      if (chosen) this._choose(chosen.dataset);
-    });
     this.directory.addEventListener("change", () => {
       this.openFolder([...this.directory.files || []].filter((file) => file.webkitRelativePath.split("/").length <= 2));
       this.directory.value = "";
@@ -96,30 +76,14 @@ export class Sources {
   }
 
   _fillMenu() {
-    const entry = (text, data) => {
-      const button = make("button", text);
-      button.type = "button";
-      Object.assign(button.dataset, data);
-      return button;
-    };
-    const charts = this.on.charts().filter(({ label }) => label !== "picture");
+    const { on } = this, charts = on.charts().filter(({ label }) => label !== "picture");
     this.menu.replaceChildren(
-      entry("Photograph or video…", { source: "file" }), entry("Folder of pictures…", { source: "folder" }),
-      entry(this.camera.isOn ? "Stop the camera" : "Camera", { source: "camera" }),
+      buttonOf("Photograph or video…", () => on.choose()), buttonOf("Folder of pictures…", () => this.directory.click()),
+      buttonOf(this.camera.isOn ? "Stop the camera" : "Camera", () => this._switchCamera()),
       make("hr"), make("h3", "Test charts"),
-      ...charts.map(({ label }) => entry(label[0].toUpperCase() + label.slice(1), { source: "chart", label })),
+      ...charts.map(({ label, value }) => buttonOf(label[0].toUpperCase() + label.slice(1),
+        () => on.connection().send({ do: "set", key: "scene", value, final: true }))),
     );
-  }
-
-  /** @param {DOMStringMap} data */
-  _choose({ source, label }) {
-    if (source === "file") this.on.choose();
-    else if (source === "folder") this.directory.click();
-    else if (source === "camera") { if (this.camera.isOn) this.stopCamera(); else this.startCamera(); }
-    else if (source === "chart") {
-      const chart = this.on.charts().find((choice) => choice.label === label);
-      if (chart) this.on.connection().send({ do: "set", key: "scene", value: chart.value, final: true });
-    }
   }
 
   // -- answers of the server --------------------------------------------------------------------------------------------------
@@ -171,8 +135,7 @@ export class Sources {
     this.transport.root.classList.toggle("live", camera.isOn);
     if (isCamera) {
       stop.textContent = camera.isOn ? "Stop" : "Start";
-      stop.title = camera.isOn ? "Stop the camera; its last frame stays the scene" : "Start the camera again";
-      stop.setAttribute("aria-label", stop.title);
+      stop.title = stop.ariaLabel = camera.isOn ? STOP : "Start the camera again";
     } else if (film && kind === "folder") [...this.strip.children].forEach((cell, k) => {
       const isCurrent = k === film.n;
       if (isCurrent && cell.getAttribute("aria-current") !== "true") cell.scrollIntoView({ block: "nearest", inline: "nearest" });
@@ -228,17 +191,11 @@ export class Sources {
     const folder = pictures.slice(0, MAX_PICTURES).map((file) => ({ file, path: null, address: null }));
     this.folder = folder;
     this.strip.replaceChildren(...folder.map((item, k) => {
-      const cell = make("button");
-      cell.type = "button";
-      cell.title = item.file.name;
-      cell.setAttribute("aria-label", item.file.name);
-      if (SHOWN.test(item.file.name)) {
-        const image = make("img");
+      const { name } = item.file, cell = titledButton("", name, () => { this.film?.pause(); this.film?.go(k); });
+      if (SHOWN.test(name)) {
         item.address = URL.createObjectURL(item.file);
-        Object.assign(image, { loading: "lazy", decoding: "async", alt: "", src: item.address });
-        cell.append(image);
-      } else cell.append(make("span", item.file.name.split(".").at(-1)));
-      cell.addEventListener("click", () => { this.film?.pause(); this.film?.go(k); });
+        cell.append(make("img", undefined, { loading: "lazy", decoding: "async", alt: "", src: item.address }));
+      } else cell.append(make("span", name.split(".").at(-1)));
       return cell;
     }));
     const film = this._folderFilm(0);
@@ -273,6 +230,8 @@ export class Sources {
   }
 
   // -- camera ---------------------------------------------------------------------------------------------------------------------
+
+  _switchCamera() { return this.camera.isOn ? this.stopCamera() : this.startCamera(); }
 
   async startCamera() {
     if (this.camera.isOn || this.isStarting) return;

@@ -2,8 +2,8 @@
 
 import { clamp } from "/web/colours.js";
 import { $, make } from "/web/page_parts.js";
+import { lasting } from "./memory.js";
 
-const STORED = "foveasim-studio-panes";
 // Smallest size of what a splitter separates, and steps of the arrow keys, in CSS pixels.
 const LEAST = 120, STEP = 16, LONG_STEP = 64;
 // A row of tiles is at least as high, in CSS pixels.
@@ -32,20 +32,21 @@ function use(name, value) {
     sizes[name] = value;
     root.style.setProperty(name, String(value));
   }
-  try { localStorage.setItem(STORED, JSON.stringify(sizes)); } catch { /* not kept */ }
+  lasting.set("panes", JSON.stringify(sizes));
 }
 
 /** @type {(place: string, id: string, label: string, way: () => Way) => HTMLElement} */
 function splitterOf(place, id, label, way) {
-  const splitter = make("div", undefined, "splitter"), sized = $(id);
+  const title = label + " (drag, arrow keys; double click for the initial size)", sized = $(id);
+  const splitter = make("div", undefined, { className: "splitter", tabIndex: 0, role: "separator", title, ariaLabel: label });
   /** @type {{ at: number, size: number, value: number } | null} */
   let start = null;
   const sizeOf = (element) => element.getBoundingClientRect()[way().axis === "x" ? "width" : "height"];
   const most = () => sizeOf(id === "tiles" ? $("views") : sized.parentElement) - LEAST;
   const grip = (at) => ({ at, size: sizeOf(sized), value: parseFloat(getComputedStyle(root).getPropertyValue(way().name)) });
   const show = () => {
-    splitter.setAttribute("aria-orientation", way().axis === "x" ? "vertical" : "horizontal");
-    splitter.setAttribute("aria-valuenow", String(clamp(Math.round((100 * sizeOf(sized)) / (most() + LEAST)), 0, 100)));
+    splitter.ariaOrientation = way().axis === "x" ? "vertical" : "horizontal";
+    splitter.ariaValueNow = String(clamp(Math.round((100 * sizeOf(sized)) / (most() + LEAST)), 0, 100));
   };
   const move = (from, by) => {
     if (!(from.size > 0)) return;
@@ -55,8 +56,6 @@ function splitterOf(place, id, label, way) {
     show();
   };
   const along = (event) => (way().axis === "x" ? event.clientX : event.clientY);
-  Object.assign(splitter, { tabIndex: 0, role: "separator", title: label + " (drag, arrow keys; double click for the initial size)" });
-  splitter.setAttribute("aria-label", label);
   splitter.setAttribute("aria-controls", id);
   splitter.addEventListener("pointerdown", (event) => { start = grip(along(event)); splitter.setPointerCapture(event.pointerId); });
   splitter.addEventListener("pointermove", (event) => { if (start) move(start, along(event) - start.at); });
@@ -86,7 +85,7 @@ export function showRows() {
 }
 
 export function startSplitters() {
-  try { sizes = JSON.parse(localStorage.getItem(STORED) || "{}") || {}; } catch { /* the initial ones */ }
+  sizes = lasting.read("panes") || {};
   for (const [name, value] of Object.entries(sizes)) if (/^--[a-z]+$/.test(name) && value > 0) root.style.setProperty(name, String(value));
   for (const each of SPLITTERS) splitterOf(...each);
 }

@@ -1,12 +1,12 @@
 // Start page: presets with thumbnails, a form of new sensors, and recent files.
 
 import { shown } from "/web/colours.js";
-import { $, make, notice } from "/web/page_parts.js";
+import { $, around, make, notice } from "/web/page_parts.js";
+import { lasting } from "./memory.js";
 import { numberOf, quantity } from "./numbers.js";
-import { awaited } from "./pending.js";
 
-// Storage of the choice not to show the page at start.
-const STORED = "foveasim-studio-start", NEVER = "never";
+// The choice not to show the page at start.
+const NEVER = "never";
 // Choices of the format: none, and an own one.
 const ANY_SIZE = "any", OWN_SIZE = "own";
 // Requirements that may be left open, with their names in messages of the page, and factors to the units of the server.
@@ -18,33 +18,21 @@ const MM_PER_UM = 1e-3;
 /** @type {(id: string, name: string) => number} */
 const givenOf = (id, name) => numberOf($(id).value, name.endsWith("_um") ? "µm" : "");
 
-const stored = {
-  get isNever() { try { return localStorage.getItem(STORED) === NEVER; } catch { return false; } },
-  set isNever(isNever) {
-    try { isNever ? localStorage.setItem(STORED, NEVER) : localStorage.removeItem(STORED); } catch { /* shown again */ }
-  },
-};
-
 // A button of a preset; its picture is loaded when it becomes visible.
 /** @param {StartPreset} preset */
 function cardOf({ name, label, text, picture }) {
-  const card = make("button", undefined, "card"), image = make("img");
-  Object.assign(image, { alt: "", loading: "lazy", width: 400, height: 300, src: "/static/presets/" + picture });
-  card.type = "button";
+  const image = make("img", undefined, { alt: "", loading: "lazy", width: 400, height: 300, src: "/static/presets/" + picture });
+  const card = around("button", { type: "button", className: "card" }, image, make("b", label), make("span", text));
   card.dataset.preset = name;
-  card.append(image, make("b", label), make("span", text));
   return card;
 }
 
 /** @param {RecentFile} file */
 function recentOf({ name, path, directory, time_s }) {
-  const item = make("li"), button = make("button");
-  button.type = "button";
-  button.dataset.path = path;
   const time = new Intl.DateTimeFormat(undefined, { dateStyle: "medium", timeStyle: "short" }).format(new Date(1000 * time_s));
-  button.append(make("span", name), make("span", time + ", " + directory));
-  item.append(button);
-  return item;
+  const button = around("button", { type: "button" }, make("span", name), make("span", time + ", " + directory));
+  button.dataset.path = path;
+  return around("li", {}, button);
 }
 
 /** @type {(id: string, choices: { name: string, label: string }[], chosen: string) => void} */
@@ -62,7 +50,7 @@ export class StartPage {
     this.newest = newest;
     this.root = $("start");
     $("start-skip").addEventListener("click", () => this.root.close());
-    $("start-never").addEventListener("change", () => { stored.isNever = $("start-never").checked; });
+    $("start-never").addEventListener("change", () => lasting.set("start", $("start-never").checked ? NEVER : ""));
     this.root.addEventListener("click", ({ target }) => {
       const { preset, path } = (target instanceof Element && target.closest("button")?.dataset) || {};
       if (preset) this._choose({ do: "preset", name: preset });
@@ -78,23 +66,14 @@ export class StartPage {
 
   // Opens the page, and then reads its contents: files may have changed. At start, the user may have chosen not to show it.
   async open({ isAtStart = false, problem = "" } = {}) {
-    if (isAtStart && stored.isNever) return;
-    $("start-never").checked = stored.isNever;
+    const isNever = lasting.get("start") === NEVER;
+    if (isAtStart && isNever) return;
+    $("start-never").checked = isNever;
     $("start-problem").textContent = problem;
     if (!this.root.open) this.root.showModal();
-    const contents = await awaited(this._read());
-    if (contents) this._use(contents);
-    else $("start-recent-note").textContent = "The server does not answer.";
-  }
-
-  /** @returns {Promise<StartContents | null>} */
-  async _read() {
-    try {
-      const answer = await fetch("/start", { headers: this.connection.headers });
-      return answer.ok ? await answer.json() : null;
-    } catch {
-      return null;
-    }
+    const contents = await this.connection.fetchStart();
+    if ("error" in contents) $("start-recent-note").textContent = contents.error + ".";
+    else this._use(contents);
   }
 
   /** @param {StartContents} contents */

@@ -3,11 +3,11 @@
 import { clamp } from "/web/colours.js";
 import { findRenderer, watchSize } from "/web/gl.js";
 import { positionText } from "/web/marks.js";
-import { $, change, endProblem, inkOf, make, notice, speak, startTheme } from "/web/page_parts.js";
+import { $, around, change, endProblem, inkOf, notice, speak, startTheme } from "/web/page_parts.js";
 import { drawScaleBar, flyTo, panByKey, spokenSite, stopFlight, zoomByKey } from "/web/shell.js";
 import { offsetsOf } from "/web/unpack.js";
 import { Editor } from "./authoring.js";
-import { Connection, memory } from "./connection.js";
+import { Connection } from "./connection.js";
 import { Controls, valueAt } from "./controls.js";
 import { Files } from "./files.js";
 import { Transport } from "./film_row.js";
@@ -15,6 +15,7 @@ import { inNextFrame } from "./frames.js";
 import { GazePanel } from "./gaze_panel.js";
 import { ImagePane } from "./image_pane.js";
 import { stateOf } from "./links.js";
+import { lasting, memory } from "./memory.js";
 import { listenToDialogs } from "./menus.js";
 import { load } from "./modules.js";
 import { awaited, isPending } from "./pending.js";
@@ -337,10 +338,7 @@ function fillPresets(presets) {
     const members = presets.filter(({ kind }) => (kind || "") === wanted);
     const options = members.map(({ name, label }) => new Option((label || name).replaceAll("_", " "), name));
     if (!wanted) return options;
-    const group = make("optgroup");
-    group.label = wanted === "shot" ? "Shots" : wanted === "layout" ? "Layouts" : wanted;
-    group.append(...options);
-    return [group];
+    return [around("optgroup", { label: wanted === "shot" ? "Shots" : wanted === "layout" ? "Layouts" : wanted }, ...options)];
   });
   $("preset").replaceChildren(new Option("Preset…", ""), ...nodes);
 }
@@ -715,9 +713,7 @@ function showTheme() {
 
 function chosenRenderer() {
   // "raster" in the storage of this address draws maps without WebGL, "webgl" also with software rendering.
-  /** @type {string | null} */
-  let wanted = null;
-  try { wanted = localStorage.getItem("foveasim-studio-map"); } catch { /* the default */ }
+  const wanted = lasting.get("map");
   const renderer = wanted === "raster" ? null : findRenderer();
   return renderer && wanted === "webgl" ? { isSlow: false } : renderer;
 }

@@ -4,7 +4,7 @@ import { brief, clamp } from "/web/colours.js";
 import { COLOUR_MAPS, mapColour } from "/web/colour_maps.js";
 import { watchSize } from "/web/gl.js";
 import { inkOf, make } from "/web/page_parts.js";
-import { FONT, axisOf, axisTitle, limitsOf } from "./charts.js";
+import { FONT, axisOf, axisTitle, limitsOf, paintTicks, paintTitles } from "./charts.js";
 import { sizeOf } from "./frames.js";
 import { isWide } from "./number_settings.js";
 import { fitted } from "./site_pane.js";
@@ -37,8 +37,7 @@ class PointChart {
     this.choose = choose;
     this.result = result;
     this.isSmaller = isSmaller;
-    this.canvas = make("canvas", undefined, "choosable");
-    this.canvas.setAttribute("role", "img");
+    this.canvas = make("canvas", undefined, { className: "choosable", role: "img" });
     this.note = make("p", HINT, "chart-note quiet");
     root.append(this.canvas, this.note);
     watchSize(this.canvas, () => this.draw());
@@ -88,20 +87,8 @@ class PointChart {
     context.font = FONT;
     context.lineWidth = 1;
     this.area = { left, top, w: width - left - right, h: height - top - bottom, width, height };
-    this.canvas.setAttribute("aria-label", this.label);
+    this.canvas.ariaLabel = this.label;
     this.paintPoints(context, this.area, !target);
-  }
-
-  _titles(context, x, y) {
-    const { left, top, w, h, height } = this.area;
-    context.fillStyle = inkOf("--quiet");
-    context.textAlign = "center";
-    context.fillText(x, left + 0.5 * w, height - 4);
-    context.save();
-    context.translate(10, top + 0.5 * h);
-    context.rotate(-Math.PI / 2);
-    context.fillText(y, 0, 0);
-    context.restore();
   }
 
   // A ring in both colours of the theme, visible on any colour.
@@ -208,7 +195,7 @@ export class HeatMap extends PointChart {
     label(axisX, x, w, WIDE_STEP, (text, at) => context.fillText(text, left + at, top + h + 14));
     context.textAlign = "right";
     label(axisY, y, h, TALL_STEP, (text, at) => context.fillText(text, left - 5, top + h - at + 4));
-    this._titles(context, axisTitle(axisX.label, axisX.unit), axisTitle(axisY.label, axisY.unit));
+    paintTitles(context, this.area, axisTitle(axisX.label, axisX.unit), axisTitle(axisY.label, axisY.unit));
   }
 
   // The bar of colours with its title above.
@@ -268,29 +255,12 @@ export class ParetoChart extends PointChart {
     return distances[nearest] <= REACH ? nearest : -1;
   }
 
-  paintPoints(context, { left, top, w, h }, isShown) {
+  paintPoints(context, area, isShown) {
     const [axisX, axisY] = this._axes(), { points, at } = this, front = this.front, isFront = new Set(front);
     const [x, y] = points.measures, places = points.values.map((values) => this._place(values));
-    context.strokeStyle = inkOf("--line");
-    context.fillStyle = inkOf("--quiet");
-    context.beginPath();
-    context.textAlign = "right";
-    for (const tick of axisY.ticks(Math.max(2, h / 34))) {
-      const ty = Math.round(top + h - axisY.at(tick) * h) + 0.5;
-      context.moveTo(left, ty);
-      context.lineTo(left + w, ty);
-      context.fillText(axisY.text(tick), left - 5, ty + 3.5);
-    }
-    context.textAlign = "center";
-    for (const tick of axisX.ticks(Math.max(2, w / 60))) {
-      const tx = Math.round(left + axisX.at(tick) * w) + 0.5;
-      context.moveTo(tx, top + h);
-      context.lineTo(tx, top + h + 4);
-      context.fillText(axisX.text(tick), tx, top + h + 15);
-    }
-    context.stroke();
     const title = ({ subject, unit }) => axisTitle(subject, unit === "fraction" ? "" : unit);
-    this._titles(context, title(x), title(y));
+    paintTicks(context, area, axisX, axisY);
+    paintTitles(context, area, title(x), title(y));
     context.strokeStyle = inkOf("--accent");
     context.lineWidth = 1.5;
     context.beginPath();

@@ -1,8 +1,9 @@
 // Form of a sweep: one or two settings with their values, and one or two results.
 
-import { make } from "/web/page_parts.js";
-import { ResultForm, fieldOf, readNumber, selectOf } from "./condition_form.js";
+import { around, make } from "/web/page_parts.js";
+import { ResultForm, orProblem, readNumber } from "./condition_form.js";
 import { fieldText } from "./controls.js";
+import { fieldOf, selectOf } from "./elements.js";
 import { SettingSelect, isWide, presentOf, rangeAround } from "./number_settings.js";
 import { numberOf } from "./numbers.js";
 
@@ -13,11 +14,7 @@ const DIRECTIONS = [["larger", "larger is better"], ["smaller", "smaller is bett
 const WITHOUT = ["seed"];
 
 /** @type {(legend: string, ...elements: HTMLElement[]) => HTMLFieldSetElement} */
-function groupOf(legend, ...elements) {
-  const group = make("fieldset", undefined, "condition");
-  group.append(make("legend", legend), ...elements);
-  return group;
-}
+const groupOf = (legend, ...elements) => around("fieldset", "condition", make("legend", legend), ...elements);
 
 // A setting, its range and the number of its values.
 class AxisForm {
@@ -26,10 +23,9 @@ class AxisForm {
 
   constructor(legend, options = {}) {
     this.setting = new SettingSelect("Setting", { ...options, without: WITHOUT });
-    this.from = fieldOf("From", "from");
-    this.to = fieldOf("To", "to");
-    this.n = fieldOf("Number of values", "values");
-    this.n.value = String(N_VALUES);
+    this.from = fieldOf("From", { placeholder: "from" });
+    this.to = fieldOf("To", { placeholder: "to" });
+    this.n = fieldOf("Number of values", { placeholder: "values", value: String(N_VALUES) });
     this.unit = make("span", "", "quiet");
     this.spacing = selectOf(SPACINGS, "Spacing");
     this.root = groupOf(legend, this.setting.root, this.from, this.to, this.unit, this.n, this.spacing);
@@ -57,8 +53,8 @@ class AxisForm {
     const { control } = this.setting, unit = control?.unit ?? "";
     for (const element of [this.from, this.to, this.unit, this.n, this.spacing]) element.hidden = !control;
     this.unit.textContent = unit;
-    this.from.setAttribute("aria-label", "From" + (unit ? ", " + unit : ""));
-    this.to.setAttribute("aria-label", "To" + (unit ? ", " + unit : ""));
+    this.from.ariaLabel = "From" + (unit ? ", " + unit : "");
+    this.to.ariaLabel = "To" + (unit ? ", " + unit : "");
   }
 
   _chooseSpacing() {
@@ -85,11 +81,9 @@ export class SweepForm {
     this.axes = [new AxisForm("Setting"), new AxisForm("Second setting", { none: "no second setting" })];
     this.results = [new ResultForm(studio.page), new ResultForm(studio.page, { none: "no second result" })];
     this.directions = this.results.map(() => selectOf(DIRECTIONS, "Direction"));
-    this.run = make("button", "Run");
-    this.run.type = "button";
-    this.root = make("div", undefined, "sweep-form");
-    const [first, second] = this.results.map((form, i) => groupOf(i ? "Second result" : "Result", form.root, this.directions[i]));
-    this.root.append(...this.axes.map(({ root }) => root), first, second, this.run);
+    this.run = make("button", "Run", { type: "button" });
+    const results = this.results.map((form, i) => groupOf(i ? "Second result" : "Result", form.root, this.directions[i]));
+    this.root = around("div", "sweep-form", ...this.axes.map(({ root }) => root), ...results, this.run);
     for (const axis of this.axes) axis.setting.root.addEventListener("change", () => { if (studio.state) axis.fill(studio.state); });
     this.results.forEach((form, i) => form.measure.addEventListener("change", () => { this._chooseDirection(i); changed(); }));
     for (const select of this.directions) select.addEventListener("change", changed);
@@ -119,11 +113,9 @@ export class SweepForm {
 
   // Returns { settings, results } of the message, or { problem }.
   read() {
-    try {
-      return { settings: this.axes.map((axis) => axis.read()).filter(Boolean),
-        results: this.results.map((form) => form.readResult()).filter(Boolean) };
-    } catch (error) {
-      return { problem: error instanceof Error ? error.message : String(error) };
-    }
+    return orProblem(() => ({
+      settings: this.axes.map((axis) => axis.read()).filter(Boolean),
+      results: this.results.map((form) => form.readResult()).filter(Boolean),
+    }));
   }
 }

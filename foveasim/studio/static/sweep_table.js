@@ -1,6 +1,7 @@
 // Table of the points of a sweep; a button in each row applies its settings.
 
-import { make } from "/web/page_parts.js";
+import { around, make } from "/web/page_parts.js";
+import { buttonOf } from "./elements.js";
 
 const cellText = (value) => (Number.isFinite(value) ? String(Number(value.toPrecision(4))) : value > 0 ? "∞" : value < 0 ? "−∞" : "–");
 
@@ -10,11 +11,8 @@ export class SweepTable {
   /** @param {HTMLElement} root @param {(k: number) => void} choose */
   constructor(root, choose) {
     this.choose = choose;
-    this.root = make("div", undefined, "sweep-table");
     // Tables scroll, also by keys.
-    this.root.tabIndex = 0;
-    this.root.setAttribute("role", "group");
-    this.root.setAttribute("aria-label", "Points of the sweep");
+    this.root = make("div", undefined, { className: "sweep-table", tabIndex: 0, role: "group", ariaLabel: "Points of the sweep" });
     root.append(this.root);
   }
 
@@ -25,27 +23,15 @@ export class SweepTable {
   }
 
   _create({ titles }) {
-    const table = make("table"), head = make("thead"), row = make("tr");
-    row.append(make("td"));
-    for (const title of titles) {
-      const cell = make("th", title);
-      cell.scope = "col";
-      row.append(cell);
-    }
-    head.append(row);
+    const row = around("tr", {}, make("td"), ...titles.map((title) => make("th", title, { scope: "col" })));
     this.body = make("tbody");
     this.n = 0;
-    table.append(head, this.body);
-    this.root.replaceChildren(table);
+    this.root.replaceChildren(around("table", {}, around("thead", {}, row), this.body));
   }
 
   _row(points, k) {
-    const row = make("tr"), button = make("button", "Apply"), cell = make("td");
-    button.type = "button";
-    button.setAttribute("aria-label", "Apply " + points.settingsText(k));
-    button.addEventListener("click", () => this.choose(k));
-    cell.append(button);
-    row.append(cell, ...[...points.settings(k), ...points.values[k]].map((value) => make("td", cellText(value))));
-    return row;
+    const button = buttonOf("Apply", () => this.choose(k), { ariaLabel: "Apply " + points.settingsText(k) });
+    const values = [...points.settings(k), ...points.values[k]];
+    return around("tr", {}, around("td", {}, button), ...values.map((value) => make("td", cellText(value))));
   }
 }

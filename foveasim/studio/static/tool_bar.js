@@ -1,6 +1,7 @@
 // The tools of the editor next to the map, and the options of the chosen one above it.
 
-import { make, notice, setChoices } from "/web/page_parts.js";
+import { around, change, make, notice, setChoices } from "/web/page_parts.js";
+import { buttonOf, fieldOf, selectOf, svgOf } from "./elements.js";
 
 // Name, key, heading, icon (lines in a square of 16), and hint.
 export const TOOLS = [
@@ -21,8 +22,8 @@ export const TOOLS = [
     "Drag a rectangle for it, or click its centre; Enter for the centre of the view."],
 ];
 const ACTIONS = [
-  ["remove", "Delete", "Delete selected sites (Delete)", "M3 4.5h10M6.5 4.5v-2h3v2M4.5 4.5l.7 9h5.6l.7-9M6.8 7v4.5M9.2 7v4.5"],
-  ["repair", "", "Repair violations of the design rules",
+  ["remove", "Delete selected sites (Delete)", "M3 4.5h10M6.5 4.5v-2h3v2M4.5 4.5l.7 9h5.6l.7-9M6.8 7v4.5M9.2 7v4.5"],
+  ["repair", "Repair violations of the design rules",
     "M10.5 2.2a3.6 3.6 0 0 0-3.3 5L2.4 12l1.9 1.9 4.8-4.8a3.6 3.6 0 0 0 4.6-4.6l-2.1 2.1-2-2z"],
 ];
 const APPLY = { polygon: "Close", cut: "Cut", merge: "Merge", split: "Split", channel: "Set", layer: "Add" };
@@ -32,37 +33,16 @@ const OPERATIONS = [["replace", "replaces sites"], ["fill", "fills gaps"], ["uni
   ["cut_out", "cuts sites out"]];
 
 function icon(path) {
-  const picture = document.createElementNS("http://www.w3.org/2000/svg", "svg");
-  const line = document.createElementNS("http://www.w3.org/2000/svg", "path");
-  picture.setAttribute("viewBox", "0 0 16 16");
-  picture.setAttribute("aria-hidden", "true");
-  for (const [name, value] of Object.entries({ d: path, fill: "none", stroke: "currentColor", "stroke-width": 1.4,
-    "stroke-linejoin": "round" })) line.setAttribute(name, value);
-  picture.append(line);
+  const picture = svgOf("svg", { viewBox: "0 0 16 16", "aria-hidden": true });
+  picture.append(svgOf("path", { d: path, fill: "none", stroke: "currentColor", "stroke-width": 1.4, "stroke-linejoin": "round" }));
   return picture;
 }
 
-function iconButton(title, path) {
-  const button = make("button");
-  button.type = "button";
-  button.title = title;
+function iconButton(name, title, path, act) {
+  const button = buttonOf("", act, { title });
+  button.dataset.tool = name;
   button.append(icon(path), make("span", title, "unseen"));
   return button;
-}
-
-function select(label, choices, values) {
-  const field = make("select");
-  field.setAttribute("aria-label", label);
-  setChoices(field, choices);
-  if (values) field.value = values;
-  return field;
-}
-
-function textField(label, { size, value = "", mode = "decimal", placeholder = "" }) {
-  const field = make("input");
-  Object.assign(field, { type: "text", size, value, inputMode: mode, autocomplete: "off", spellcheck: false, placeholder });
-  field.setAttribute("aria-label", label);
-  return field;
 }
 
 export class ToolBar {
@@ -80,15 +60,12 @@ export class ToolBar {
   constructor(pane, on) {
     const stage = pane.querySelector(".stage");
     this.on = on;
-    this.strip = make("div", undefined, "tool-strip");
-    this.strip.setAttribute("role", "toolbar");
-    this.strip.setAttribute("aria-label", "Tools");
-    this.strip.setAttribute("aria-orientation", "vertical");
+    this.strip = make("div", undefined, { className: "tool-strip", role: "toolbar", ariaLabel: "Tools", ariaOrientation: "vertical" });
     this.buttons = new Map(TOOLS.map(([name, key, title, path]) =>
-      [name, this._button(name, title + " (" + key.toUpperCase() + ")", path, () => on.use(name))]));
-    const [remove, repair] = ACTIONS.map(([name, , title, path]) => this._button(name, title, path, () => on.act(name)));
+      [name, iconButton(name, title + " (" + key.toUpperCase() + ")", path, () => on.use(name))]));
+    const [remove, repair] = ACTIONS.map(([name, title, path]) => iconButton(name, title, path, () => on.act(name)));
     this.actions = { remove, repair };
-    for (const button of this.buttons.values()) button.setAttribute("aria-pressed", "false");
+    for (const button of this.buttons.values()) button.ariaPressed = "false";
     this.strip.append(...this.buttons.values(), make("hr"), remove, repair);
     this.strip.addEventListener("keydown", (event) => {
       const step = { ArrowDown: 1, ArrowRight: 1, ArrowUp: -1, ArrowLeft: -1 }[event.key];
@@ -98,50 +75,34 @@ export class ToolBar {
       event.preventDefault();
       event.stopPropagation();
     });
-    this.row = make("div", undefined, "tool-options");
-    this.row.setAttribute("role", "group");
-    this.row.setAttribute("aria-label", "Options of the tool");
+    this.row = make("div", undefined, { className: "tool-options", role: "group", ariaLabel: "Options of the tool" });
     this._buildOptions();
     stage.prepend(this.strip);
     stage.before(this.row);
     this.show(false);
   }
 
-  _button(name, title, path, act) {
-    const button = iconButton(title, path);
-    button.dataset.tool = name;
-    button.addEventListener("click", act);
-    return button;
-  }
-
   _buildOptions() {
     const { on } = this;
     this.fields = {
-      overlap: select("What happens to sites below", OVERLAPS), channel: select("Filter", [["", "nearest filter"]]),
-      n_x: textField("Parts along x", { size: 2, value: "2", mode: "numeric" }),
-      n_y: textField("Parts along y", { size: 2, value: "1", mode: "numeric" }),
-      generator: select("Generator", []), operation: select("Operation", OPERATIONS),
-      margin_um: textField("Margin in µm", { size: 3, value: "0" }),
-      at: textField("Position in µm: x, y, or @dx, dy from the last one", { size: 11, mode: "text", placeholder: "x, y" }),
-      grid: textField("Grid in µm", { size: 3 }),
+      overlap: selectOf(OVERLAPS, "What happens to sites below"), channel: selectOf([["", "nearest filter"]], "Filter"),
+      n_x: fieldOf("Parts along x", { size: 2, value: "2", inputMode: "numeric" }),
+      n_y: fieldOf("Parts along y", { size: 2, value: "1", inputMode: "numeric" }),
+      generator: selectOf([], "Generator"), operation: selectOf(OPERATIONS, "Operation"),
+      margin_um: fieldOf("Margin in µm", { size: 3, value: "0", inputMode: "decimal" }),
+      at: fieldOf("Position in µm: x, y, or @dx, dy from the last one", { size: 11, placeholder: "x, y", inputMode: "text" }),
+      grid: fieldOf("Grid in µm", { size: 3, inputMode: "decimal" }),
     };
-    this.applyButton = make("button", "Apply", "apply");
-    this.applyButton.type = "button";
-    this.applyButton.addEventListener("click", on.apply);
-    this.rulesButton = make("button", "", "rules-button");
-    this.rulesButton.type = "button";
-    this.rulesButton.addEventListener("click", on.rules);
+    this.applyButton = buttonOf("Apply", on.apply, { className: "apply" });
+    this.rulesButton = buttonOf("", on.rules, { className: "rules-button" });
     this.hint = make("p", "", "tool-hint");
-    this.problem = make("p", "", "tool-problem");
-    this.problem.setAttribute("role", "alert");
+    this.problem = make("p", "", { className: "tool-problem", role: "alert" });
     const part = (tools, label, ...nodes) => {
-      const span = make("label", label);
-      span.append(...nodes);
+      const span = around("label", {}, label, ...nodes);
       this.parts.push([tools, span]);
       return span;
     };
-    const { fields } = this, note = make("div", undefined, "tool-note");
-    note.append(this.hint, this.problem, this.rulesButton);
+    const { fields } = this, note = around("div", "tool-note", this.hint, this.problem, this.rulesButton);
     this.row.append(
       part(["polygon", "rectangle"], "", fields.overlap), part(["polygon", "rectangle", "channel"], "", fields.channel),
       part(["split"], "x", fields.n_x), part(["split"], "y", fields.n_y),
@@ -170,7 +131,7 @@ export class ToolBar {
   show(isOn) { this.strip.hidden = this.row.hidden = !isOn; }
 
   use(tool) {
-    for (const [name, button] of this.buttons) button.setAttribute("aria-pressed", String(name === tool));
+    for (const [name, button] of this.buttons) button.ariaPressed = String(name === tool);
     const [, , title, , hint] = TOOLS.find(([name]) => name === tool) || TOOLS[0];
     this.usual = title.replace("…", "") + ": " + hint[0].toLowerCase() + hint.slice(1);
     for (const [tools, span] of this.parts) span.hidden = !tools.includes(tool);
@@ -194,17 +155,13 @@ export class ToolBar {
 
   // note: instead of the usual hint; error: the last answer of the server; isReady: whether the button applies something.
   describe({ note, error, isReady, isSelected, rules, position, step }) {
-    const write = (element, text) => { if (element.textContent !== text) element.textContent = text; };
-    write(this.hint, note || this.usual);
-    this.hint.title = this.hint.textContent;
-    this.hint.hidden = Boolean(error);
+    const hint = note || this.usual;
+    change(this.hint, { textContent: hint, title: hint, hidden: Boolean(error) });
     this.hint.classList.toggle("warm", Boolean(note));
-    write(this.problem, error || "");
-    this.problem.hidden = !error;
+    change(this.problem, { textContent: error || "", hidden: !error });
     this.applyButton.disabled = !isReady;
     this.actions.remove.disabled = !isSelected;
-    write(this.rulesButton, rules.text);
-    this.rulesButton.title = rules.title;
+    change(this.rulesButton, { textContent: rules.text, title: rules.title });
     this.rulesButton.classList.toggle("wrong", rules.isWrong);
     this.actions.repair.disabled = !rules.exist;
     this._showPosition(position);

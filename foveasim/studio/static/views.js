@@ -1,6 +1,8 @@
 // Views: the server lists them; each is a module in views/, which is imported when its view is first needed.
 
-import { $, find, make, notice } from "/web/page_parts.js";
+import { $, around, find, make, notice } from "/web/page_parts.js";
+import { buttonOf } from "./elements.js";
+import { lasting } from "./memory.js";
 import { load } from "./modules.js";
 import { showRows } from "./splitters.js";
 
@@ -42,29 +44,18 @@ export class Views {
       return;
     }
     this.list = list;
-    /** @type {unknown} */
-    let chosen;
-    try { chosen = JSON.parse(localStorage.getItem("foveasim-studio-tiles") || "null"); } catch { /* the first ones */ }
+    const chosen = lasting.read("tiles");
     /** @type {(view: ViewAbout) => boolean} */
     const isFirst = innerWidth >= WIDE ? (view) => view.is_wide : (view) => view.is_first;
-    const tiles = list.filter((each) => each.is_tile), groups = new Map(tiles.map(({ group }) => [group, make("div")]));
-    for (const [name, group] of groups) {
-      group.setAttribute("role", "group");
-      group.setAttribute("aria-label", name);
-      group.append(make("span", name, "quiet"));
-    }
+    const tiles = list.filter((each) => each.is_tile), groups = new Map(tiles.map(({ group: name }) =>
+      [name, around("div", { role: "group", ariaLabel: name }, make("span", name, "quiet"))]));
     $("tabs").replaceChildren(...groups.values());
     for (const view of tiles) {
-      const tile = make("section", undefined, "tile"), button = make("button", view.label);
-      tile.id = "tile-" + view.name;
-      // Tiles scroll, also by keys.
-      tile.tabIndex = 0;
-      tile.setAttribute("aria-label", view.label);
-      tile.append(make("h2", view.label));
-      button.type = "button";
+      const button = buttonOf(view.label, () => this.show(view.name, !this.shown.has(view.name)));
       button.dataset.tile = view.name;
-      button.addEventListener("click", () => this.show(view.name, !this.shown.has(view.name)));
-      $("tiles").append(tile);
+      // Tiles scroll, also by keys.
+      $("tiles").append(around("section", { className: "tile", id: "tile-" + view.name, tabIndex: 0, ariaLabel: view.label },
+        make("h2", view.label)));
       groups.get(view.group)?.append(button);
       if (Array.isArray(chosen) ? chosen.includes(view.name) : isFirst(view)) this.shown.add(view.name);
       this._mark(view.name);
@@ -88,7 +79,7 @@ export class Views {
     if (isShown === this.shown.has(name)) return Promise.resolve();
     if (isShown) this.shown.add(name);
     else this.shown.delete(name);
-    try { localStorage.setItem("foveasim-studio-tiles", JSON.stringify([...this.shown])); } catch { /* not kept */ }
+    lasting.set("tiles", JSON.stringify([...this.shown]));
     this._mark(name);
     showRows();
     if (this.made[name]) this._refresh(name);
@@ -110,7 +101,7 @@ export class Views {
   /** @param {string} name */
   _mark(name) {
     $("tile-" + name).hidden = !this.shown.has(name);
-    find(document, `#tabs button[data-tile="${name}"]`).setAttribute("aria-pressed", String(this.shown.has(name)));
+    find(document, `#tabs button[data-tile="${name}"]`).ariaPressed = String(this.shown.has(name));
     this._call(name, "onShown", this.shown.has(name));
   }
 

@@ -2,7 +2,7 @@
 
 import { brief, clamp, shown, unitText } from "./colours.js";
 import { context2d } from "./gl.js";
-import { inkOf, make } from "./page_parts.js";
+import { around, inkOf, make } from "./page_parts.js";
 
 // More categories than this are not listed.
 const MOST_KINDS = 40;
@@ -14,9 +14,7 @@ export const titleOf = (column) => (column.unit ? column.label + " / " + unitTex
 
 // Draws the colours of a scale, one row per filter on a mosaic.
 export function drawRamp(context, scale, width, height) {
-  const rows = scale.tables.length, strip = make("canvas");
-  strip.width = 256;
-  strip.height = rows;
+  const rows = scale.tables.length, strip = make("canvas", undefined, { width: 256, height: rows });
   const stripContext = context2d(strip, { willReadFrequently: true }), image = stripContext.createImageData(256, rows);
   scale.tables.forEach((shades, row) => shades.forEach((shade, i) => image.data.set([...shade, 255], 4 * (256 * row + i))));
   stripContext.putImageData(image, 0, 0);
@@ -47,11 +45,7 @@ export function kindsOf(scale) {
 }
 
 // List item of a text after squares of colours.
-export function swatchItem({ colours, text }) {
-  const item = make("li");
-  item.append(...swatchesOf(colours), make("span", text));
-  return item;
-}
+export function swatchItem({ colours, text }) { return around("li", {}, ...swatchesOf(colours), make("span", text)); }
 
 // Squares of colours.
 export function swatchesOf(colours) {

@@ -2,7 +2,7 @@
 
 import { shown } from "./colours.js";
 import { titleOf } from "./legend.js";
-import { downloadText, make } from "./page_parts.js";
+import { around, downloadText, make } from "./page_parts.js";
 
 // Length and direction of a line between two points in µm.
 export function lengthText([x0, y0], [x1, y1]) {
@@ -45,27 +45,21 @@ const figure = (value) => (Number.isNaN(value) ? "–" : shown(Number(value.toPr
 
 // Rows of a table: one line with the name of each column, one with its statistics or categories.
 export function statisticsRows(columns, chosen) {
-  const head = make("tr");
-  head.append(...COLUMNS.map((name) => { const cell = make("th", name); cell.scope = "col"; return cell; }));
-  const rows = [head];
+  const rows = [around("tr", {}, ...COLUMNS.map((name) => make("th", name, { scope: "col" })))], colSpan = COLUMNS.length;
   for (const column of columns) {
     if (column.is_repeat || !column.values) continue;
-    const name = make("tr"), label = make("th", titleOf(column)), line = make("tr");
-    label.colSpan = COLUMNS.length;
-    name.append(label);
+    const line = make("tr");
     if (column.names) {
       const counts = new Map();
       for (const site of chosen) counts.set(column.values[site], (counts.get(column.values[site]) || 0) + 1);
       const kinds = [...counts].sort((a, b) => b[1] - a[1]);
-      const cell = make("td", kinds.slice(0, 6).map(([kind, n]) => column.names[kind] + " " + shown(n)).join(", ")
-        + (kinds.length > 6 ? ", …" : ""));
-      cell.colSpan = COLUMNS.length;
-      line.append(cell);
+      const all = kinds.slice(0, 6).map(([kind, n]) => column.names[kind] + " " + shown(n)).join(", ");
+      line.append(make("td", all + (kinds.length > 6 ? ", …" : ""), { colSpan }));
     } else {
       const found = statistics(column.values, chosen);
       line.append(...COLUMNS.map((key) => make("td", key === "n" ? shown(found.n) : figure(found[key]))));
     }
-    rows.push(name, line);
+    rows.push(around("tr", {}, make("th", titleOf(column), { colSpan })), line);
   }
   return rows;
 }

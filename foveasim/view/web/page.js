@@ -351,7 +351,7 @@ function listenToPicture() {
 function hover(x, y, from) {
   const all = state.sites.pickAll(x, y);
   state.cursor = { x, y, from };
-  state.hovered = all.length ? all[all.length - 1] : -1;
+  state.hovered = all.at(-1) ?? -1;
   state.others = all.slice(0, -1);
   $("cursor").textContent = rulerText() || "x " + positionText(x, state.map.scale) + "  y " + positionText(y, state.map.scale) + " µm";
   tellSite();
@@ -782,7 +782,7 @@ const handle = {
   ready: Promise.resolve(),
   complete: Promise.resolve(),
   readyMs: NaN,
-  pick: (x, y) => { const all = state.sites.pickAll(x, y); return all.length ? all[all.length - 1] : -1; },
+  pick: (x, y) => state.sites.pick(x, y),
   pickAll: (x, y) => state.sites.pickAll(x, y),
   values: (site) => Object.fromEntries(about.columns.map((c) => [c.key, c.names ? c.names[c.values[site]] : c.values[site]])),
   colour: (site) => state.scale.colour(site),

@@ -18,17 +18,31 @@ export function find(root, selector) {
   return found;
 }
 
+// Makes an element; about: its class, or its properties, such as ariaLabel.
 /**
  * @template {keyof HTMLElementTagNameMap} Tag
  * @param {Tag} tag
  * @param {string | number} [text]
- * @param {string} [className]
+ * @param {string | Partial<HTMLElementTagNameMap[Tag]>} [about]
  * @returns {HTMLElementTagNameMap[Tag]}
  */
-export function make(tag, text, className) {
+export function make(tag, text, about = {}) {
   const element = document.createElement(tag);
   if (text !== undefined) element.textContent = String(text);
-  if (className) element.className = className;
+  return Object.assign(element, typeof about === "string" ? { className: about } : about);
+}
+
+// Makes an element around others, or texts.
+/**
+ * @template {keyof HTMLElementTagNameMap} Tag
+ * @param {Tag} tag
+ * @param {string | Partial<HTMLElementTagNameMap[Tag]>} about
+ * @param {(Node | string)[]} content
+ * @returns {HTMLElementTagNameMap[Tag]}
+ */
+export function around(tag, about, ...content) {
+  const element = make(tag, undefined, about);
+  element.append(...content);
   return element;
 }
 
@@ -162,8 +176,14 @@ export function listenToHelp() {
     else return;
     event.preventDefault();
   });
-  keys.addEventListener("click", (event) => {
-    const box = keys.getBoundingClientRect(), { clientX: x, clientY: y } = event;
-    if (event.target === keys && (x < box.left || x > box.right || y < box.top || y > box.bottom)) keys.close();
+  closeOutside(keys);
+}
+
+// Closes a dialog by a click outside.
+/** @param {HTMLDialogElement} dialog */
+export function closeOutside(dialog) {
+  dialog.addEventListener("click", ({ target, clientX: x, clientY: y }) => {
+    const box = dialog.getBoundingClientRect();
+    if (target === dialog && (x < box.left || x > box.right || y < box.top || y > box.bottom)) dialog.close();
   });
 }

@@ -1,7 +1,7 @@
 // List of violations of design rules.
 
 import { shown } from "./colours.js";
-import { change, make, setChoices } from "./page_parts.js";
+import { around, change, make, setChoices } from "./page_parts.js";
 import { Violations } from "./violations.js";
 
 const AT_A_TIME = 200;
@@ -68,14 +68,12 @@ export class RulesList {
 
   _item(violations, i) {
     const { rule, sites, value } = violations.describe(i);
-    const item = make("li"), button = make("button");
-    button.type = "button";
+    const title = rule.name + ": " + sites + (value ? ", " + value : "");
+    const button = around("button", { type: "button", title },
+      make("span", this.rule < 0 ? rule.name + ": " + sites : sites), make("span", value));
     button.dataset.violation = i;
-    button.title = rule.name + ": " + sites + (value ? ", " + value : "");
-    button.append(make("span", this.rule < 0 ? rule.name + ": " + sites : sites), make("span", value));
     button.addEventListener("click", () => { this.choose(i); this.fly(i); });
-    item.append(button);
-    return item;
+    return around("li", {}, button);
   }
 
   choose(i) {

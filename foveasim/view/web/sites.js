@@ -131,6 +131,10 @@ export class Sites {
     return found;
   }
 
+  // The last, and thus uppermost, site that contains a point; -1 for none.
+  /** @type {(x: number, y: number) => number} */
+  pick(x, y) { return this.pickAll(x, y).at(-1) ?? -1; }
+
   /** @param {number} site @param {number} x @param {number} y */
   holds(site, x, y) {
     const { box, xy, position, ringOffsets } = this, at = 4 * site;

@@ -7,7 +7,8 @@ import { context2d, findRenderer, fitCanvas, pixelRatio, textureSize, watchSize 
 import { drawRamp, kindsOf, pictureOf, summaryOf, swatchItem, swatchesOf, tickLabels, titleOf } from "./legend.js";
 import { Orbit } from "./orbit.js";
 import { ABOVE, ASIDE, OrbitGestures } from "./orbit_gestures.js";
-import { $, downloadPicture, find, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice } from "./page_parts.js";
+import { $, around, downloadPicture, find, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme,
+  stayingNotice } from "./page_parts.js";
 import { drawScaleBar, siteHeading, spokenSite } from "./shell.js";
 import { SolidView } from "./solid_view.js";
 import { unpack } from "./unpack.js";
@@ -188,12 +189,8 @@ function moveCut(steps) {
 }
 
 function listenToTools() {
-  const own = ["", about.ownColours ?? "of the parts"];
-  $("colouring").append(...[own, ...about.columns.map((column) => [column.key, titleOf(column)])].map(([key, text]) => {
-    const option = make("option", text);
-    option.value = key;
-    return option;
-  }));
+  const own = about.ownColours ?? "of the parts";
+  $("colouring").append(new Option(own, ""), ...about.columns.map((column) => new Option(titleOf(column), column.key)));
   $("colour-map").append(...COLOUR_MAPS.map((name) => make("option", name)));
   $("colouring").addEventListener("change", () => { $("colour-map").value = COLOUR_MAPS[0]; colourBy($("colouring").value); });
   $("colour-map").addEventListener("change", () => colourBy($("colouring").value));
@@ -231,13 +228,10 @@ function coloursOf(part) {
 }
 
 function partItem(part) {
-  const item = make("li"), label = make("label"), box = make("input");
-  box.type = "checkbox";
-  box.checked = true;
+  const box = make("input", undefined, { type: "checkbox", checked: true });
   box.addEventListener("change", () => { state.view.setVisible(part, box.checked); gestures.moved(); });
-  label.append(box, ...swatchesOf(coloursOf(part)), make("span", part.name + " · " + shown(part.nTriangles) + " triangles"));
-  item.append(label);
-  return item;
+  const text = part.name + " · " + shown(part.nTriangles) + " triangles";
+  return around("li", {}, around("label", {}, box, ...swatchesOf(coloursOf(part)), make("span", text)));
 }
 
 // -- loading --------------------------------------------------------------------------------------------------------------

@@ -1,7 +1,8 @@
 // Table of the compared variants: budgets and picture quality.
 
 import { quantity, shown } from "/web/colours.js";
-import { make, setChoices } from "/web/page_parts.js";
+import { around, make } from "/web/page_parts.js";
+import { buttonOf, selectOf } from "../elements.js";
 
 const EMPTY = "Press A|B to keep the present sensor as A and change it, or compare named variants.";
 // Notes on rows, by name.
@@ -10,7 +11,6 @@ const NOTES = { frames_per_s: "At the highest data rate of the variants",
   read_noise_e: "Median over all photosites, without quantisation",
   readout_steps: "Photosites on the longest readout line; lines are read in parallel", area_mm2: "Total area of the photosites" };
 // What B can have in common with A.
-/** @type {[string, string][]} */
 const MATCHES = [["field", "same field"], ["n_sites", "same number of photosites"], ["both", "same field and number"],
   ["data_rate", "same data rate"]];
 // Four digits; "∞" for an infinite value, "–" without value.
@@ -26,11 +26,7 @@ function difference([first, ...others], unit) {
   return last === first ? "0" : (last > first ? "+" : "−") + figure(Math.abs(last - first), unit);
 }
 
-function heading(text) {
-  const cell = make("th", text);
-  cell.scope = "col";
-  return cell;
-}
+const heading = (text) => make("th", text, { scope: "col" });
 
 // Shows a comparison; null without variants.
 function show({ table, note, match }, about, hasMatch) {
@@ -39,20 +35,17 @@ function show({ table, note, match }, about, hasMatch) {
   note.textContent = about ? "" : EMPTY;
   if (!about) return;
   const sizes = [about.fovea_um, about.field_um].map((side) => shown(Math.round(side))), { names } = about;
-  const head = make("tr"), isQuality = (name) => /^(fovea|field)_/.test(name);
-  head.append(make("td"), ...names.map(heading), heading(names[names.length - 1] + " − " + names[0]));
+  const isQuality = (name) => /^(fovea|field)_/.test(name);
+  const head = around("tr", {}, make("td"), ...names.map(heading), heading(names[names.length - 1] + " − " + names[0]));
   const rows = about.rows.map(({ name, label, unit, values, best }) => {
-    const row = make("tr"), title = make("th", label + (isQuality(name) && !about.has_equal_fields ? " (fields differ)" : ""));
-    title.scope = "row";
-    row.dataset.name = name;
+    const title = make("th", label + (isQuality(name) && !about.has_equal_fields ? " (fields differ)" : ""), { scope: "row" });
     title.title = NOTES[name] || "";
     if (isQuality(name)) title.title = "Against the optical image, after a fit of one gain, on a square of "
       + sizes[name.startsWith("fovea") ? 0 : 1] + " µm";
-    row.append(title, ...values.map((value, k) => {
-      const cell = make("td", name === "n_sites" ? shown(value) : figure(value, unit));
-      cell.classList.toggle("best", best.includes(k));
-      return cell;
-    }), make("td", difference(values, unit)));
+    const cells = values.map((value, k) =>
+      make("td", name === "n_sites" ? shown(value) : figure(value, unit), best.includes(k) ? "best" : {}));
+    const row = around("tr", {}, title, ...cells, make("td", difference(values, unit)));
+    row.dataset.name = name;
     row.classList.toggle("differs", values.some((value) => value !== values[0]));
     return row;
   });
@@ -66,19 +59,12 @@ function show({ table, note, match }, about, hasMatch) {
 }
 
 export function create(root, { page, connection }) {
-  const head = make("div", undefined, "head"), button = make("button", "Match B to A"), table = make("table");
-  const note = make("p", "", "quiet"), match = make("span", undefined, "match"), what = make("select");
+  const what = selectOf(MATCHES, "What B has in common with A"), table = make("table", undefined, { id: "comparison" });
+  const button = buttonOf("Match B to A", () => connection.send({ do: "match", what: /** @type {any} */ (what.value) }), { id: "match" });
+  const note = make("p", "", { className: "quiet", id: "comparison-note" }), match = around("span", "match", what, button);
   const elements = { table, note, match };
-  setChoices(what, MATCHES);
   what.id = "match-what";
-  what.setAttribute("aria-label", "What B has in common with A");
-  match.append(what, button);
-  Object.assign(button, { type: "button", id: "match" });
-  table.id = "comparison";
-  note.id = "comparison-note";
-  head.append(root.querySelector("h2"), match);
-  root.append(head, note, table);
-  button.addEventListener("click", () => connection.send({ do: "match", what: /** @type {any} */ (what.value) }));
+  root.append(around("div", "head", root.querySelector("h2"), match), note, table);
   show(elements, null, false);
   // Rows of an earlier variant A are not those of the next one.
   const variants = new WeakMap();

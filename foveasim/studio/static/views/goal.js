@@ -4,18 +4,15 @@ import { make, notice } from "/web/page_parts.js";
 import { addFiles } from "../chart_files.js";
 import { CurveChart } from "../charts.js";
 import { ConditionForm } from "../condition_form.js";
+import { buttonOf } from "../elements.js";
 import { percent } from "../problems.js";
 import { SettingSelect, isWide } from "../number_settings.js";
 import { figure } from "./requirements.js";
 
 export function create(root, studio) {
-  const form = new ConditionForm(studio.page), setting = new SettingSelect("Setting to change"), solve = make("button", "Solve");
-  const text = make("p", "", "quiet"), frame = make("div", undefined, "chart");
-  solve.type = "button";
-  text.id = "goal-text";
-  text.setAttribute("role", "status");
-  text.textContent = "Choose a setting and the result that it must give.";
-  frame.id = "goal";
+  const form = new ConditionForm(studio.page), setting = new SettingSelect("Setting to change"), solve = buttonOf("Solve", seek);
+  const text = make("p", "Choose a setting and the result that it must give.", { className: "quiet", id: "goal-text", role: "status" });
+  const frame = make("div", undefined, { className: "chart", id: "goal" });
   form.root.prepend(setting.root);
   form.root.append(solve);
   root.append(form.root, text, frame);
@@ -25,13 +22,13 @@ export function create(root, studio) {
   // Number of the last message, until it is answered.
   /** @type {number | null} */
   let asked = null;
-  solve.addEventListener("click", () => {
+  form.value.addEventListener("keydown", (event) => { if (event.key === "Enter") seek(); });
+  function seek() {
     const { requirement, problem } = form.read();
     if (problem) { notice(problem); return; }
     text.textContent = "seeking…";
     asked = studio.connection.send({ do: "seek", key: setting.root.value, requirement });
-  });
-  form.value.addEventListener("keydown", (event) => { if (event.key === "Enter") solve.click(); });
+  }
   // The measures are those of the requirements.
   studio.views.need("requirements", true);
   return {

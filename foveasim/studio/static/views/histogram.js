@@ -1,7 +1,7 @@
 // Histogram and statistics of the values that the map shows.
 
 import { statistics } from "/web/measure.js";
-import { make } from "/web/page_parts.js";
+import { around, make } from "/web/page_parts.js";
 import { addFiles } from "../chart_files.js";
 import { percent } from "../problems.js";
 import { Histogram } from "../charts.js";
@@ -21,9 +21,8 @@ function statisticsOf({ column, sites }) {
 }
 
 export function create(root, { page, panes, setRange }) {
-  const frame = make("div", undefined, "chart"), list = make("dl", undefined, "figures"), chart = new Histogram(frame, setRange);
-  frame.id = "histogram";
-  list.id = "statistics";
+  const frame = make("div", undefined, { className: "chart", id: "histogram" }), chart = new Histogram(frame, setRange);
+  const list = make("dl", undefined, { className: "figures", id: "statistics" });
   root.append(frame, list);
   addFiles(root, "Histogram", () => chart);
   const draw = () => {
@@ -40,11 +39,7 @@ export function create(root, { page, panes, setRange }) {
       const isSignal = b.column.is_signal || ["code", "picture"].includes(b.column.key);
       if (isSignal && fraction) figures.saturated = percent(fraction);
       if (isSignal && n && figures.n !== quantity(n)) figures.n += " of " + quantity(n);
-      list.replaceChildren(...Object.entries(figures).map(([name, value]) => {
-        const item = make("div");
-        item.append(make("dt", name), make("dd", value));
-        return item;
-      }));
+      list.replaceChildren(...Object.entries(figures).map(([name, value]) => around("div", {}, make("dt", name), make("dd", value))));
       // The page draws it with the mark of the photosite.
       chart.use(b.scale, page.frozen && a.scale?.column.key === b.column.key ? a.scale : null);
     },

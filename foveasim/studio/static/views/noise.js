@@ -5,9 +5,8 @@ import { barRows } from "../charts.js";
 import { quantity } from "../numbers.js";
 
 export function create(root) {
-  const bars = make("ul", undefined, "bars"), note = make("p", "", "quiet"), warning = make("p", "", "warning");
-  bars.id = "noise";
-  note.id = "noise-note";
+  const bars = make("ul", undefined, { className: "bars", id: "noise" });
+  const note = make("p", "", { className: "quiet", id: "noise-note" }), warning = make("p", "", "warning");
   root.append(bars, note, warning);
   return {
     use({ about: { sources, unit, saturation, is_coarse: isCoarse, read_e: read } }, before) {

@@ -1,7 +1,8 @@
 // Requirements of the settings: each with its result and its margin, and a form for new ones.
 
-import { make, notice } from "/web/page_parts.js";
+import { around, make, notice } from "/web/page_parts.js";
 import { ConditionForm } from "../condition_form.js";
+import { buttonOf } from "../elements.js";
 import { quantity } from "../numbers.js";
 import { percent } from "../problems.js";
 
@@ -12,33 +13,28 @@ export function figure(value, unit) {
 }
 
 export function create(root, studio) {
-  const list = make("ul", undefined, "requirements"), form = new ConditionForm(studio.page), add = make("button", "Add");
+  const list = make("ul", undefined, { className: "requirements", id: "requirements" }), form = new ConditionForm(studio.page);
   const note = make("p", "No requirements yet.", "quiet");
-  list.id = "requirements";
-  add.type = "button";
-  form.root.append(add);
+  form.root.append(buttonOf("Add", add));
   root.append(note, list, form.root);
+  form.value.addEventListener("keydown", (event) => { if (event.key === "Enter") add(); });
   const present = () => studio.state?.settings.requirements || [];
-  add.addEventListener("click", () => {
+  const use = (requirements) => studio.connection.set("requirements", requirements, true);
+
+  function add() {
     const { requirement, problem } = form.read();
     if (problem) notice(problem);
-    else studio.connection.set("requirements", [...present(), requirement], true);
-  });
-  form.value.addEventListener("keydown", (event) => { if (event.key === "Enter") add.click(); });
+    else use([...present(), requirement]);
+  }
 
   function itemOf(row, i) {
-    const item = make("li"), mark = make("b", row.is_met ? "✓" : "✗"), remove = make("button", "✕", "step-remove");
     const margin = row.margin === null ? row.problem : "got " + figure(row.value, row.unit) + ", margin " + figure(row.margin, row.unit)
       + (row.saturated_fraction ? ", " + percent(row.saturated_fraction) + " saturated" : "");
-    item.classList.toggle("wrong", !row.is_met);
-    mark.setAttribute("aria-label", row.is_met ? "met" : "not met");
-    remove.type = "button";
-    remove.setAttribute("aria-label", "Remove: " + row.text);
-    remove.addEventListener("click", () => studio.connection.set("requirements", present().filter((_, k) => k !== i), true));
-    const text = make("span", row.text);
-    text.append(make("br"), make("small", margin));
-    item.append(mark, text, remove);
-    return item;
+    const mark = make("b", row.is_met ? "✓" : "✗", { ariaLabel: row.is_met ? "met" : "not met" });
+    const remove = buttonOf("✕", () => use(present().filter((_, k) => k !== i)),
+      { className: "step-remove", ariaLabel: "Remove: " + row.text });
+    const text = around("span", {}, row.text, make("br"), make("small", margin));
+    return around("li", row.is_met ? {} : "wrong", mark, text, remove);
   }
 
   return {

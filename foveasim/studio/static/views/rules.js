@@ -1,13 +1,15 @@
 // Design rules: their results, and violations on the map.
 
-import { change, make, notice } from "/web/page_parts.js";
+import { around, change, make, notice } from "/web/page_parts.js";
 import { RulesList } from "/web/rules_list.js";
+import { buttonOf, selectOf } from "../elements.js";
 import { RepairDialog } from "../repair_dialog.js";
 
 export function create(root, { panes: { b }, fly, ask, connection }) {
-  const frame = make("div"), repair = make("button", "Repair…"), repaired = make("p", "", "quiet");
-  const elements = { select: make("select"), note: make("p", "", "quiet"),
-    list: make("ol", undefined, "violations"), more: make("button", "Show more") };
+  const openDialog = () => dialog.open(connection.send({ do: "preview_repairs" }));
+  const repair = buttonOf("Repair…", openDialog, { id: "repair" }), repaired = make("p", "", { className: "quiet", id: "repaired" });
+  const elements = { select: selectOf([], "Design rule"), note: make("p", "", "quiet"),
+    list: make("ol", undefined, "violations"), more: make("button", "Show more", { type: "button" }) };
   const list = new RulesList(elements, (i) => {
     const at = list.frameOf(i, b.map);
     if (at) fly(...at);
@@ -18,16 +20,7 @@ export function create(root, { panes: { b }, fly, ask, connection }) {
   const dialog = new RepairDialog({
     apply: (method) => { isAwaited = true; connection.send({ do: "repair", method }); }, cancel: () => connection.cancel(),
   });
-  const openDialog = () => dialog.open(connection.send({ do: "preview_repairs" }));
-  repair.type = "button";
-  repair.id = "repair";
-  repaired.id = "repaired";
-  repair.addEventListener("click", openDialog);
-  frame.id = "rules";
-  elements.select.setAttribute("aria-label", "Design rule");
-  elements.more.type = "button";
-  frame.append(repair, repaired, ...Object.values(elements));
-  root.append(frame);
+  root.append(around("div", { id: "rules" }, repair, repaired, ...Object.values(elements)));
   list.select.addEventListener("change", () => ask("map"));
   Object.assign(b, {
     drawViolations: (context, map) => list.draw(context, map, b.sites),

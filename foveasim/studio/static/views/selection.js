@@ -2,23 +2,19 @@
 
 import { shown } from "/web/colours.js";
 import { downloadTable, statisticsRows } from "/web/measure.js";
-import { make } from "/web/page_parts.js";
+import { around, make } from "/web/page_parts.js";
+import { buttonOf } from "../elements.js";
 import { percent } from "../problems.js";
 
 const HINT = "Press S and drag on the photosites to select some of them.";
 
 export function create(root, { page, panes, select }) {
-  const heading = root.querySelector("h2"), row = make("div", undefined, "row"), table = make("table");
-  const save = make("button", "CSV"), clear = make("button", "Clear");
-  const note = make("p", HINT, "quiet");
-  Object.assign(save, { type: "button", id: "export", disabled: true });
-  Object.assign(clear, { type: "button", id: "clear-selection", disabled: true });
+  const heading = root.querySelector("h2"), note = make("p", HINT, "quiet"), table = make("table", undefined, { id: "selection" });
+  const save = buttonOf("CSV", () => downloadTable(panes.b.sites, panes.b.columns, page.selected, "studio"),
+    { id: "export", disabled: true });
+  const clear = buttonOf("Clear", () => select(null), { id: "clear-selection", disabled: true });
   heading.id = "selection-heading";
-  table.id = "selection";
-  row.append(save, clear);
-  root.append(row, note, table);
-  save.addEventListener("click", () => downloadTable(panes.b.sites, panes.b.columns, page.selected, "studio"));
-  clear.addEventListener("click", () => select(null));
+  root.append(around("div", "row", save, clear), note, table);
   return {
     onSelection() {
       const { selected } = page, isAny = Boolean(page.rectangle) || selected.length > 0;

@@ -2,6 +2,7 @@
 
 import { siteHeading, siteRows } from "/web/shell.js";
 import { change, make } from "/web/page_parts.js";
+import { buttonOf } from "../elements.js";
 
 // Index of the site nearest to the centre of the layout, found once for each.
 /** @type {WeakMap<object, number>} */
@@ -22,13 +23,9 @@ function nearest(sites) {
 }
 
 export function create(root, { page, panes, keep }) {
-  const heading = root.querySelector("h2"), list = make("dl", undefined, "table");
+  const heading = root.querySelector("h2"), list = make("dl", undefined, { className: "table", id: "site" });
+  const compare = buttonOf("Compare in charts", () => keep(Number(compare.dataset.site)), { id: "compare-site" });
   heading.id = "site-heading";
-  list.id = "site";
-  const compare = make("button", "Compare in charts");
-  compare.type = "button";
-  compare.id = "compare-site";
-  compare.addEventListener("click", () => keep(Number(compare.dataset.site)));
   root.append(list, compare);
   return {
     onSite() {
@@ -38,8 +35,7 @@ export function create(root, { page, panes, keep }) {
       change(heading, { textContent: siteHeading(site, page.pinned, chosen >= 0 ? [] : ["nearest to the centre"]) });
       const isKept = page.kept.includes(site);
       compare.dataset.site = String(site);
-      change(compare, { textContent: isKept ? "Remove from charts" : "Compare in charts" });
-      compare.setAttribute("aria-pressed", String(isKept));
+      change(compare, { textContent: isKept ? "Remove from charts" : "Compare in charts", ariaPressed: String(isKept) });
       list.replaceChildren(...siteRows(sites, columns, site, 4).flatMap(([label, text]) => [make("dt", label), make("dd", text)]));
     },
   };

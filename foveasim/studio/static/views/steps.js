@@ -1,8 +1,9 @@
 // The list of edits of the layout: their order, and their numbers as fields.
 
-import { make } from "/web/page_parts.js";
+import { around, make } from "/web/page_parts.js";
 import { fieldText, listOf } from "../controls.js";
 import { CHOICES, describe } from "../edits.js";
+import { buttonOf, fieldOf, selectOf } from "../elements.js";
 
 const BUTTONS = [["up", "↑", "Move up"], ["down", "↓", "Move down"], ["copy", "+", "Duplicate"], ["remove", "✕", "Delete"]];
 
@@ -64,61 +65,37 @@ class Steps {
   }
 
   _item(edit, i, n) {
-    const item = make("li"), line = make("div", undefined, "step"), { name, detail } = describe(edit), isOpen = i === this.opened;
-    const head = make("button", undefined, "step-name");
-    head.append(make("span", i + 1 + ". " + name), make("span", detail));
-    head.title = name + ": " + detail;
-    head.setAttribute("aria-expanded", String(isOpen));
-    head.addEventListener("click", () => {
+    const { name, detail } = describe(edit), isOpen = i === this.opened;
+    const head = buttonOf("", () => {
       this.opened = this.opened === i ? -1 : i;
       this.choose(this.opened === i ? i : null);
       this.update();
-    });
-    const actions = make("div", undefined, "step-actions");
-    actions.append(...BUTTONS.map(([action, sign, title]) => {
-      const button = make("button", sign, "step-" + action);
-      button.title = title;
-      button.setAttribute("aria-label", title + ": step " + (i + 1));
-      button.dataset.at = action + i;
-      button.disabled = (action === "up" && i === 0) || (action === "down" && i === n - 1);
-      button.addEventListener("click", () => this._act(action, i));
-      return button;
-    }));
-    line.append(head, actions);
+    }, { className: "step-name", title: name + ": " + detail, ariaExpanded: String(isOpen) });
+    head.append(make("span", i + 1 + ". " + name), make("span", detail));
     head.dataset.at = "name" + i;
-    for (const button of line.querySelectorAll("button")) button.type = "button";
-    item.append(line);
-    if (isOpen) item.append(this._fields(edit, i));
-    return item;
+    const actions = BUTTONS.map(([action, sign, title]) => {
+      const button = buttonOf(sign, () => this._act(action, i), { className: "step-" + action, title,
+        ariaLabel: title + ": step " + (i + 1), disabled: (action === "up" && i === 0) || (action === "down" && i === n - 1) });
+      button.dataset.at = action + i;
+      return button;
+    });
+    const line = around("div", "step", head, around("div", "step-actions", ...actions));
+    return around("li", {}, line, ...(isOpen ? [this._fields(edit, i)] : []));
   }
 
   _fields(edit, i) {
     const grid = make("div", undefined, "step-fields");
     for (const [path, value] of parametersOf(edit)) {
-      const key = path.at(-1), label = make("label", key.replace(/_um$/, " / µm").replaceAll("_", " ")), choices = CHOICES[key];
+      const key = path.at(-1), name = key.replace(/_um$/, " / µm").replaceAll("_", " "), choices = CHOICES[key];
       let field;
       if (choices && typeof value === "string") {
-        field = make("select");
-        field.append(...choices.map((choice) => {
-          const option = make("option", choice.replaceAll("_", " "));
-          option.value = choice;
-          return option;
-        }));
+        field = selectOf(choices.map((choice) => [choice, choice.replaceAll("_", " ")]), name);
         field.value = value;
-      } else if (typeof value === "boolean") {
-        field = make("input");
-        field.type = "checkbox";
-        field.checked = value;
-      } else {
-        field = make("input");
-        field.type = "text";
-        field.spellcheck = false;
-        field.value = fieldText(value);
-      }
+      } else if (typeof value === "boolean") field = make("input", undefined, { type: "checkbox", checked: value });
+      else field = fieldOf(name, { value: fieldText(value) });
       field.dataset.at = "field" + i + path.join(".");
       field.addEventListener("change", () => this._set(i, path, field, value));
-      label.append(field);
-      grid.append(label);
+      grid.append(around("label", {}, name, field));
     }
     return grid;
   }
@@ -153,8 +130,7 @@ class Steps {
 }
 
 export function create(root, { editor, flyToStep }) {
-  const frame = make("div"), steps = new Steps(frame, editor, flyToStep);
-  frame.id = "steps";
+  const frame = make("div", undefined, { id: "steps" }), steps = new Steps(frame, editor, flyToStep);
   root.append(frame);
   return { onState: () => steps.update(), open: (index) => steps.open(index) };
 }

@@ -1,6 +1,6 @@
 // Summary of the result, beside that of variant A, and warnings.
 
-import { make } from "/web/page_parts.js";
+import { around, make } from "/web/page_parts.js";
 import { quantity } from "../numbers.js";
 import { percent } from "../problems.js";
 
@@ -25,22 +25,17 @@ function summaryRows(summary, before) {
   const text = (key, of) => textOf(key, of) + (["mean_dn", "median_e"].includes(key) && of.saturated_fraction > 0
     ? " (" + percent(of.saturated_fraction) + " saturated)" : "");
   const rows = Object.entries(summary).filter(([key, value]) => typeof value === "number" && key !== "height_um").map(([key, value]) => {
-    const row = make("tr"), name = make("th", SUMMARY[key]?.[0] || key.replaceAll("_", " "));
-    name.scope = "row";
-    row.append(name, ...(before ? [make("td", text(key, before))] : []), make("td", text(key, summary)));
+    const name = make("th", SUMMARY[key]?.[0] || key.replaceAll("_", " "), { scope: "row" });
+    const row = around("tr", {}, name, ...(before ? [make("td", text(key, before))] : []), make("td", text(key, summary)));
     row.classList.toggle("differs", Boolean(before) && before[key] !== value);
     return row;
   });
   if (!before) return rows;
-  const head = make("tr");
-  head.append(make("td"), ...["A", "B"].map((name) => { const cell = make("th", name); cell.scope = "col"; return cell; }));
-  return [head, ...rows];
+  return [around("tr", {}, make("td"), ...["A", "B"].map((name) => make("th", name, { scope: "col" }))), ...rows];
 }
 
 export function create(root, { page }) {
-  const table = make("table"), warnings = make("ul");
-  table.id = "summary";
-  warnings.id = "warnings";
+  const table = make("table", undefined, { id: "summary" }), warnings = make("ul", undefined, { id: "warnings" });
   root.append(table, warnings);
   return {
     onState() {

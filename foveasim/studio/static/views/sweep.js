@@ -1,10 +1,10 @@
 // Sweep: results over one or two settings, with charts and a table whose points can be applied.
 
 import { brief } from "/web/colours.js";
-import { change, make, notice } from "/web/page_parts.js";
+import { around, change, make, notice } from "/web/page_parts.js";
 import { addFiles } from "../chart_files.js";
 import { CurveChart, listenToPoints } from "../charts.js";
-import { selectOf } from "../condition_form.js";
+import { buttonOf, selectOf } from "../elements.js";
 import { presentOf } from "../number_settings.js";
 import { HINT, HeatMap, ParetoChart } from "../sweep_charts.js";
 import { SweepForm } from "../sweep_form.js";
@@ -35,21 +35,14 @@ function curvesOf(points, j) {
 
 export function create(root, studio) {
   const form = new SweepForm(studio, { changed: () => chart?.draw() });
-  const text = make("p", START, "quiet"), bar = make("progress"), frame = make("div", undefined, "chart");
-  const display = selectOf([], "Chart"), stop = make("button", "Cancel"), file = make("button", "Sweep file");
-  const panel = make("div", undefined, "sweep-panel"), results = make("div", undefined, "sweep-results");
-  const row = make("div", undefined, "condition");
-  text.id = "sweep-text";
-  text.setAttribute("role", "status");
-  bar.setAttribute("aria-label", "Points of the sweep");
-  frame.id = "sweep";
-  for (const button of [stop, file]) button.type = "button";
-  stop.setAttribute("aria-label", "Cancel the sweep");
-  file.title = "YAML file for the command foveasim sweep, which gives the same results";
-  row.append(display, stop, file);
-  results.append(text, bar, row, frame);
-  panel.append(form.root, results);
-  root.append(panel);
+  const text = make("p", START, { className: "quiet", id: "sweep-text", role: "status" });
+  const bar = make("progress", undefined, { ariaLabel: "Points of the sweep", hidden: true });
+  const frame = make("div", undefined, { className: "chart", id: "sweep" }), display = selectOf([], "Chart");
+  const stop = buttonOf("Cancel", () => studio.connection.send({ do: "stop_sweep" }), { ariaLabel: "Cancel the sweep" });
+  const file = buttonOf("Sweep file", () => studio.connection.send({ do: "sweep_file" }),
+    { title: "YAML file for the command foveasim sweep, which gives the same results" });
+  const row = around("div", { className: "condition", hidden: true }, display, stop, file);
+  root.append(around("div", "sweep-panel", form.root, around("div", "sweep-results", text, bar, row, frame)));
   /** @type {any} */
   let chart = null;
   /** @type {SweepPoints | null} */
@@ -155,10 +148,7 @@ export function create(root, studio) {
     if (problem) { notice(problem); return; }
     asked = studio.connection.send({ do: "sweep", settings, results: wanted });
   });
-  stop.addEventListener("click", () => studio.connection.send({ do: "stop_sweep" }));
-  file.addEventListener("click", () => studio.connection.send({ do: "sweep_file" }));
   display.addEventListener("change", () => show(false));
-  row.hidden = bar.hidden = true;
   addFiles(root, "Sweep", () => chart);
   // The measures are those of the requirements.
   studio.views.need("requirements", true);

@@ -1,23 +1,8 @@
 // Variants: named states with notes, which are applied again, compared, and kept in the directory for saved files.
 
-import { make } from "/web/page_parts.js";
+import { around, make } from "/web/page_parts.js";
+import { fieldOf, titledButton } from "../elements.js";
 import { confirmed } from "../menus.js";
-
-function fieldOf(label, value, placeholder) {
-  const field = make("input");
-  Object.assign(field, { type: "text", value, placeholder, autocomplete: "off", spellcheck: false });
-  field.setAttribute("aria-label", label);
-  return field;
-}
-
-function buttonOf(text, label, act) {
-  const button = make("button", text);
-  button.type = "button";
-  button.title = label;
-  button.setAttribute("aria-label", label);
-  button.addEventListener("click", act);
-  return button;
-}
 
 // The first name that no variant has.
 function freeName(variants) {
@@ -28,12 +13,9 @@ function freeName(variants) {
 }
 
 export function create(root, studio) {
-  const list = make("ul", undefined, "variants"), form = make("form"), add = make("button", "Keep");
-  const field = fieldOf("Name of the variant", "", "");
+  const list = make("ul", undefined, { className: "variants", id: "variants" }), field = fieldOf("Name of the variant");
+  const form = around("form", { id: "keep-variant" }, field, make("button", "Keep"));
   const note = make("p", "Keep the present state under a name, to return to it and to compare it with others.", "quiet");
-  list.id = "variants";
-  form.id = "keep-variant";
-  form.append(field, add);
   root.append(form, note, list);
   let shown = "";
   const all = () => studio.state?.variants || [];
@@ -52,30 +34,24 @@ export function create(root, studio) {
   }
 
   function itemOf({ id, name, note: text, is_compared: isCompared, problem }) {
-    const item = make("li"), box = make("input"), title = fieldOf("Name", name, ""), about = fieldOf("Note on " + name, text, "note");
-    box.type = "checkbox";
-    box.checked = isCompared;
-    box.setAttribute("aria-label", "Compare " + name);
-    box.title = "Compare with the present state";
+    const title = fieldOf("Name", { value: name }), about = fieldOf("Note on " + name, { value: text, placeholder: "note" });
+    const box = make("input", undefined, { type: "checkbox", checked: isCompared, title: "Compare with the present state",
+      ariaLabel: "Compare " + name });
     box.addEventListener("change", () => compare(id, box.checked));
     const describe = () => send({ do: "variant", action: "describe", variant: id, name: title.value, note: about.value });
     for (const each of [title, about]) each.addEventListener("change", describe);
     const ask = async (action, question, verb) => {
       if (await confirmed(question, verb)) send({ do: "variant", action, variant: id });
     };
-    const actions = make("div", undefined, "variant-actions"), replace = "Replace " + name + " by the present state";
-    actions.append(
-      buttonOf("Apply", "Apply " + name, () => send({ do: "apply", variant: id })),
-      buttonOf("As A", "Show " + name + " as A", () => studio.freeze(id)),
-      buttonOf("Update", replace, () => ask("update", replace + "?", "Replace")),
-      buttonOf("Delete", "Delete " + name, () => ask("delete", "Delete " + name + "?", "Delete")),
+    const replace = "Replace " + name + " by the present state", actions = around("div", "variant-actions",
+      titledButton("Apply", "Apply " + name, () => send({ do: "apply", variant: id })),
+      titledButton("As A", "Show " + name + " as A", () => studio.freeze(id)),
+      titledButton("Update", replace, () => ask("update", replace + "?", "Replace")),
+      titledButton("Delete", "Delete " + name, () => ask("delete", "Delete " + name + "?", "Delete")),
     );
     for (const [k, each] of [box, title, about, ...actions.children].entries()) each.setAttribute("data-at", k + id);
-    const line = make("div", undefined, "variant");
-    line.append(box, title, about);
-    item.append(line, actions);
-    if (problem) item.append(make("p", problem, "error"));
-    return item;
+    const problems = problem ? [make("p", problem, "error")] : [];
+    return around("li", {}, around("div", "variant", box, title, about), actions, ...problems);
   }
 
   return {
