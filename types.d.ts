@@ -117,7 +117,7 @@ interface SweepMessage {
   kind: "sweep"; id: number; state: "running" | "stopped" | "lost" | "done"; axes: SweepAxis[];
   results: { measure: string; label: string; subject: string; unit: string }[]; n_points: number; points: (number | string | null)[][];
   start: { settings: (number | null)[]; results: (number | string | null)[] | null }; problem: string; n_failed: number;
-  isLost?: boolean;
+  saturated: number[] | null; isLost?: boolean;
 }
 interface Exists { kind: "exists"; id: number; name: string; file: string }
 interface Saved { kind: "saved"; id: number; path: string }

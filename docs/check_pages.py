@@ -108,7 +108,9 @@ def wide_code(site: Path) -> Iterator[str]:
         is_docstring = page.parent.name == "made"
         for block in parsed(page).xpath(f"{blocks}//pre"):
             for line in block.text_content().split("\n"):
-                if len(line) > MAX_COLUMNS and not (is_docstring and not line.startswith((">>> ", "... "))):
+                if len(line) > MAX_COLUMNS and not (
+                    is_docstring and not line.startswith((">>> ", "... "))
+                ):
                     where = page.relative_to(site)
                     yield f"{where}: {len(line)} columns: {line.strip()[:60]}"
 

@@ -106,7 +106,7 @@ def test_points_of_signals_have_saturation(recorder):
 
     assert found["saturated"] == [float(np.mean(each == 1023)) for each in codes]
     assert found["saturated"][0] == 0.0 < found["saturated"][-1]
-    assert run(recorder, exposure, [{"measure": "n_sites"}], number=8)["saturated"] == [0.0, 0.0, 0.0]
+    assert run(recorder, exposure, [{"measure": "n_sites"}], number=8)["saturated"] is None
 
 
 def test_integers_are_distinct(recorder):

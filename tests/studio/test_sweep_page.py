@@ -92,6 +92,23 @@ def test_map_point_is_applied_by_a_click(visit):
     assert page.is_disabled("#undo")
 
 
+def test_saturated_points_are_marked(visit):
+    page = open_sweep(visit)
+    choose_axis(page, "Setting", "exposure_s", low="1 ms", high="0.5 s", n=3)
+    group(page, "Result").locator("select[aria-label=Result]").select_option(value="snr")
+    run(page)
+    saturated = page.evaluate("studio.views.made.sweep.points.saturated")
+
+    assert saturated[0] == 0.0 < saturated[-1]
+    assert page.inner_text("#sweep .chart-note").startswith("Rings: some photosites are saturated.")
+    assert f", {100 * saturated[-1]:.2g} % saturated" in page.evaluate("studio.views.made.sweep.points.text(2)")
+    page.select_option("#tile-sweep select[aria-label=Chart]", "table")
+    assert page.locator("#tile-sweep th").last.inner_text() == "saturated / %"
+    assert float(page.locator("#tile-sweep tbody tr").last.locator("td").last.inner_text()) == pytest.approx(
+        100 * saturated[-1], rel=1e-3
+    )
+
+
 def test_curves_and_their_files(visit):
     page = open_sweep(visit)
     choose_axis(page, "Setting", "layout.parameters.n_sectors", low=24, high=48, n=3)

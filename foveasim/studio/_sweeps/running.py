@@ -53,7 +53,7 @@ class Sweep:
         self._settings: list[dict[str, Any] | None] = [None] * len(self._points)
         #: Values of the results: of the settings at the start, and of the points so far.
         self._values: list[list[float]] = []
-        #: Fraction of saturated photosites in these, where a result depends on it.
+        #: Fraction of saturated photosites in these, which is sent where a result depends on it.
         self._saturated: list[float] = []
         self._is_of_signals = any(metric_info(each.measure).is_of_signals for each in results)
         self._problem = ""
@@ -96,7 +96,7 @@ class Sweep:
             self._explain(line(error))
         else:
             values = [self._measured(result, simulated, line) for result in self.results]
-            saturated = simulated.capture.saturated_fraction if self._is_of_signals else 0.0
+            saturated = simulated.capture.saturated_fraction
         self.stopped_s = None
         self._values.append(values)
         self._saturated.append(saturated)
@@ -131,7 +131,7 @@ class Sweep:
             "n_points": len(self._points),
             "start": {"settings": list(self._present), "results": self._values[0] if self._values else None},
             "points": points,
-            "saturated": self._saturated[1:],
+            "saturated": self._saturated[1:] if self._is_of_signals else None,
             "problem": self._problem,
             "n_failed": sum(any(math.isnan(value) for value in point) for point in points),
         }

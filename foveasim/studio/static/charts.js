@@ -142,7 +142,7 @@ export class CurveChart {
   }
 
   // Curves: [{ label, name, unit_x, unit_y, x, y, isDashed, isLimit }]; marks on them: [{ x, y, name, kind }], "end" for a bar,
-  // "point" for a small dot, else a dot; vertical lines: [{ x, label, of }].
+  // "point" for a small dot, "open" for a ring, else a dot; vertical lines: [{ x, label, of }].
   use(curves, { marks = [], lines = [], note = "" } = {}) {
     Object.assign(this, { curves, marks, lines });
     this.note.textContent = unitText(note);
@@ -272,8 +272,13 @@ export class CurveChart {
     context.lineWidth = 1.5;
     context.beginPath();
     if (mark.kind === "end") context.rect(x - 1.25, y - 6, 2.5, 12);
-    else context.arc(x, y, mark.kind === "point" ? 3 : 4.5, 0, 7);
+    else context.arc(x, y, mark.kind === "point" || mark.kind === "open" ? 3 : 4.5, 0, 7);
     context.stroke();
+    context.fill();
+    if (mark.kind !== "open") return;
+    context.fillStyle = inkOf("--raised");
+    context.beginPath();
+    context.arc(x, y, 1.75, 0, 7);
     context.fill();
   }
 

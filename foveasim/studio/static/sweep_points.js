@@ -2,6 +2,7 @@
 
 import { axisTitle } from "./charts.js";
 import { quantity } from "./numbers.js";
+import { percent } from "./problems.js";
 import { figure } from "./views/requirements.js";
 
 const NUMBERS = { ".inf": Infinity, "-.inf": -Infinity };
@@ -27,12 +28,14 @@ export function paretoFront(results, isSmaller) {
 
 export class SweepPoints {
   /** @param {SweepMessage} message */
-  constructor({ axes, results, points, start, n_points: n }) {
+  constructor({ axes, results, points, start, saturated, n_points: n }) {
     this.n = n;
     this.axes = axes;
     this.measures = results;
     this.values = points.map((each) => each.map(numberOfResult));
     this.start = start;
+    // Fractions of saturated photosites, if a result depends on them.
+    this.saturated = saturated;
   }
 
   // Settings of a point, in the order of the axes; the last axis varies fastest.
@@ -45,8 +48,12 @@ export class SweepPoints {
   // Titles of the settings and of the results.
   get titles() {
     return [...this.axes.map(({ label, unit }) => axisTitle(label, unit)),
-      ...this.measures.map(({ subject, unit }) => axisTitle(subject, unit))];
+      ...this.measures.map(({ subject, unit }) => axisTitle(subject, unit)), ...(this.saturated ? ["saturated / %"] : [])];
   }
+
+  // Numbers of a point below these titles.
+  /** @param {number} k */
+  row(k) { return [...this.settings(k), ...this.values[k], ...(this.saturated ? [100 * this.saturated[k]] : [])]; }
 
   // Results of all points so far.
   /** @param {number} j */
@@ -73,13 +80,13 @@ export class SweepPoints {
   text(k) {
     const results = this.values[k].map((value, j) => this.measures[j].subject + " "
       + figure(Number.isFinite(value) ? value : value > 0 ? ".inf" : value < 0 ? "-.inf" : null, this.measures[j].unit));
-    return this.settingsText(k) + ": " + results.join(", ");
+    return this.settingsText(k) + ": " + results.join(", ") + (this.saturated?.[k] ? ", " + percent(this.saturated[k]) + " saturated" : "");
   }
 
   // Rows of a file: the settings and results of all points so far, and further columns.
   /** @type {(more?: { [name: string]: (k: number) => string | number }) => (string | number)[][]} */
   rows(more = {}) {
-    return [[...this.titles, ...Object.keys(more)], ...this.values.map((values, k) =>
-      [...this.settings(k), ...values.map((value) => (Number.isNaN(value) ? "" : value)), ...Object.values(more).map((of) => of(k))])];
+    return [[...this.titles, ...Object.keys(more)], ...this.values.map((_, k) =>
+      [...this.row(k).map((value) => (Number.isNaN(value) ? "" : value)), ...Object.values(more).map((of) => of(k))])];
   }
 }

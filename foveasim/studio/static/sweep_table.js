@@ -31,7 +31,6 @@ export class SweepTable {
 
   _row(points, k) {
     const button = buttonOf("Apply", () => this.choose(k), { ariaLabel: "Apply " + points.settingsText(k) });
-    const values = [...points.settings(k), ...points.values[k]];
-    return around("tr", {}, around("td", {}, button), ...values.map((value) => make("td", cellText(value))));
+    return around("tr", {}, around("td", {}, button), ...points.row(k).map((value) => make("td", cellText(value))));
   }
 }

@@ -70,11 +70,13 @@ export function create(root, studio) {
     const use = () => {
       const curves = curvesOf(points, j), n = points?.axes[1]?.values.length ?? 1;
       /** @type {any} */
-      const marks = curves.flatMap(({ name, x, y }) => x.map((v, i) => ({ x: v, y: y[i], name, kind: "point" })));
+      const marks = curves.flatMap(({ name, x, y, points: of }) =>
+        x.map((v, i) => ({ x: v, y: y[i], name, kind: points?.saturated?.[of[i]] ? "open" : "point" })));
       /** @type {any} */
       const lines = [{ x: present()[0], label: "", of: "" }];
       found.use(curves, { marks: marks.filter((mark) => Number.isFinite(mark.y)), lines,
-        note: (n > curves.length ? curves.length + " of " + n + " values. " : "") + HINT });
+        note: (n > curves.length ? curves.length + " of " + n + " values. " : "")
+          + (points?.saturated?.some(Boolean) ? "Rings: some photosites are saturated. " : "") + HINT });
     };
     use();
     return { use, draw: () => found.draw(), rows: () => points?.rows() ?? [], paint: (target) => found.paint(target) };
