@@ -49,6 +49,7 @@ WORDS: dict[str, Words] = {
     "dark_reference_k": Words(
         "reference temperature", "Temperature at which the dark current is given.", synonyms="dark current"
     ),
+    "dbu_um": Words("database unit", synonyms="dbu grid,klayout"),
     "dead_fraction": Words("dead sites", synonyms="defects bad pixels"),
     "device_seed": Words(synonyms="device fixed pattern"),
     "disabled": Words("disabled effects", synonyms="switch off without noise"),

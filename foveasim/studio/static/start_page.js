@@ -3,7 +3,7 @@
 import { shown } from "/web/colours.js";
 import { $, around, make, notice } from "/web/page_parts.js";
 import { lasting } from "./memory.js";
-import { numberOf, quantity } from "./numbers.js";
+import { numberOf, quantity, unitText } from "./numbers.js";
 
 // The choice not to show the page at start.
 const NEVER = "never";
@@ -119,7 +119,7 @@ export class StartPage {
     $("start-filters-hint").textContent = $("start-filters").value && !generator?.has_mosaic
       ? "This layout has no rows for a mosaic: red, green and blue are assigned so that neighbours differ." : "";
     const found = electronics.find(({ name }) => name === $("start-electronics").value);
-    $("start-electronics-hint").textContent = found ? found.scaling + " Source: " + found.source + "." : "";
+    $("start-electronics-hint").textContent = found ? unitText(found.scaling + " Source: " + found.source + ".") : "";
   }
 
   // Width and height of the chosen format in mm; null if they follow.
