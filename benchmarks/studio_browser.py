@@ -132,7 +132,9 @@ class Studio:
         self.server, address = start_server(*self.options, token=self.token)
         self.port = address.split("/")[2].rpartition(":")[2]
         self.playwright = sync_playwright().start()
-        browser = self.playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(arguments))
+        browser = self.playwright.chromium.launch(
+            executable_path=shutil.which("chromium-headless-shell") or shutil.which("chromium"), args=list(arguments)
+        )
         context = browser.new_context(viewport={"width": 1440, "height": 900}, bypass_csp=True)
         context.add_init_script("localStorage.setItem('foveasim-studio-start', 'never')")  # the table at once
         self.page: Page = context.new_page()
