@@ -8,6 +8,7 @@ from types import MappingProxyType
 from foveasim._core.calls import Limits, declarations_of, publish
 from foveasim.sensor.budget import FIXED, TEMPORAL, NoiseBudget, noise_budget
 from foveasim.sensor.calibration import Calibration, calibrate, linearise
+from foveasim.sensor.datasheet import DataSheet, read_datasheet
 from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.shot import draw_shot_noise
 from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, non_destructive_reads
@@ -50,6 +51,7 @@ __all__ = [
     "ConstantCurve",
     "CrosstalkOperator",
     "Curve",
+    "DataSheet",
     "Diffusion",
     "FilterSet",
     "Footprints",
@@ -84,6 +86,7 @@ __all__ = [
     "noise_budget",
     "non_destructive_reads",
     "read_curve",
+    "read_datasheet",
     "read_filters",
     "rgb_filters",
     "signal_to_noise",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -46,6 +47,7 @@ from foveasim.sensor.chain import (
     run_steps,
     sort_by_stage,
 )
+from foveasim.sensor.datasheet import DataSheet, read_datasheet
 from foveasim.sensor.device import Device
 from foveasim.sensor.effects import Collection, Effect, Photosites, Sites, Stage
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset
@@ -343,6 +345,51 @@ class Sensor:
         """
         ideal = cls(layout)  # checks the layout
         return cls(layout, **(find_preset(preset).values(ideal.layout.area_um2) | parameters))
+
+    @classmethod
+    def from_datasheet(
+        cls, layout: OwnCheck[Photosites], sheet: OwnCheck[DataSheet | str | Path], **parameters: Any
+    ) -> Sensor:
+        """
+        Create a sensor from the values of a data sheet in the terms of EMVA 1288.
+
+        Parameters
+        ----------
+        layout : Layout
+        sheet : DataSheet or path
+            Values of the sheet, or its YAML file (:func:`foveasim.sensor.read_datasheet`). Sites of other areas than the pixel
+            have full wells, dark currents and steps of the ADC in proportion to their area.
+        **parameters
+            Other parameters of the class, such as ``filters``, or values instead of those of the sheet, such as a curve of the
+            quantum efficiency.
+
+        Raises
+        ------
+        ParameterError
+            If the sheet or a parameter is invalid.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> sheet = fs.sensor.DataSheet(
+        ...     pixel_um=2.25,
+        ...     bits=12,
+        ...     qe_percent=91.25,
+        ...     gain_dn_per_e=0.399,
+        ...     dark_noise_e=5.56,
+        ...     saturation_e=9458,
+        ...     black_level_dn=240,
+        ... )
+        >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.25)
+        >>> sensor = fs.Sensor.from_datasheet(layout, sheet)
+        >>> sensor.bits, sensor.read_noise_e, sensor.pedestal_v * 4096
+        (12, 5.56, 240.0)
+        """
+        if not isinstance(sheet, DataSheet | str | Path):
+            raise ParameterError("sheet", f"must be a DataSheet, or the path of one, got {type_name(sheet)}")
+        found = sheet if isinstance(sheet, DataSheet) else read_datasheet(sheet)
+        ideal = cls(layout)  # checks the layout
+        return cls(layout, **(found.parameters(ideal.layout.area_um2) | parameters))
 
     @classmethod
     def from_settings(

@@ -1,0 +1,195 @@
+"""Data sheets of EMVA 1288: to a sensor, and by a measurement of the standard back to the sheet."""
+
+import numpy as np
+import pytest
+import yaml
+from reference.data_sheets import MISPRINTED, SHEETS
+from scipy import stats
+
+import foveasim as fs
+from foveasim.sensor import DataSheet, read_datasheet
+from foveasim.sensor.datasheet import _range_of, limit_of_saturation
+
+#: A sheet with the quantities that a sensor needs.
+PLAIN = {"pixel_um": 3.45, "bits": 12, "qe_percent": 64, "dark_noise_e": "2.1", "saturation_e": 10_400}
+N_SIDE, N_FRAMES, EXPOSURE_S = 300, 4, 0.01
+
+
+def measured(sensor, saturation_e):
+    """EMVA 1288 parameters of simulated frames, with many levels next to the saturation, and many frames for DSNU and PRNU."""
+    signals_e = saturation_e * np.concatenate((np.linspace(0.05, 0.9, 18), np.linspace(0.92, 1.05, 27)))
+    half = int(np.abs(signals_e - 0.5 * saturation_e).argmin())
+
+    def frames(signal_e, n_frames, seed):
+        expected_e = sensor.expected_electrons(np.full(sensor.layout.n_sites, signal_e / EXPOSURE_S), EXPOSURE_S)
+        return fs.metrics.draw_frames(sensor, expected_e, n_frames=n_frames, seed=seed, exposure_s=EXPOSURE_S)
+
+    light = [
+        frames(each, 60 if abs(k - half) < 2 else 24 if each > 0.9 * saturation_e else N_FRAMES, k)
+        for k, each in enumerate(signals_e)
+    ]
+    return fs.metrics.emva1288(light, [frames(0.0, 60, 999)], signals_e / float(sensor.qe))
+
+
+#: Quantities of a sheet and those of a measurement.
+MEASURED = {
+    "qe_percent": lambda found: 100.0 * found.qe,
+    "gain_dn_per_e": lambda found: found.gain_dn_per_e,
+    "dark_noise_e": lambda found: found.dark_noise_e,
+    "dark_noise_dn": lambda found: found.dark_noise_dn,
+    "threshold_ph": lambda found: found.threshold_ph,
+    "threshold_e": lambda found: found.threshold_e,
+    "saturation_ph": lambda found: found.saturation_ph,
+    "saturation_e": lambda found: found.saturation_e,
+    "snr_max_db": lambda found: found.snr_max_db,
+    "dynamic_range_db": lambda found: found.dynamic_range_db,
+    "dsnu_e": lambda found: found.dsnu_e,
+    "prnu_percent": lambda found: 100.0 * found.prnu_fraction,
+}
+
+
+@pytest.mark.slow(keep=2)
+@pytest.mark.parametrize("name", SHEETS)
+def test_measurement_returns_the_sheet(name):
+    """Each printed value within 1 %, or its rounding; decibels as ratios."""
+    printed = SHEETS[name]
+    sheet = DataSheet(**printed)
+    side_um = float(sheet.value("pixel_um"))
+    sensor = fs.Sensor.from_datasheet(fs.layout.grid(n_x=N_SIDE, n_y=N_SIDE, pitch_um=side_um), sheet)
+    found = measured(sensor, sheet.value("saturation_e"))
+
+    assert found.underflow_fraction[0] < 0.005
+    for quantity, of in MEASURED.items():
+        if quantity not in printed:
+            continue
+        value, (low, high) = float(of(found)[0]), _range_of(quantity, printed[quantity])
+        # Full codes cut the noise of this sensor below its saturation: its response is not linear there.
+        fraction = 0.017 if name == "imx900_low_gain" and quantity.startswith("saturation") else 0.01
+        tolerance = 20.0 * np.log10(1.01) if quantity.endswith("_db") else fraction * value
+        assert low - tolerance <= value <= high + tolerance, (quantity, printed[quantity], value)
+
+
+def test_implied_values_are_those_of_a_complete_sheet():
+    """Five values of the IMX900 imply the others, which its sheet prints."""
+    complete = SHEETS["imx900_low_gain"]
+    given = ("pixel_um", "bits", "qe_percent", "gain_dn_per_e", "dark_noise_e", "saturation_e")
+    sheet = DataSheet(**{name: complete[name] for name in given})
+
+    for name in ("threshold_e", "threshold_ph", "saturation_ph", "snr_max_db", "dynamic_range_db", "dark_noise_dn"):
+        low, high = _range_of(name, complete[name])
+        # Values that follow from rounded ones.
+        assert low - 2e-3 * high <= sheet.value(name) <= high * (1.0 + 2e-3), name
+        assert name in sheet.derived
+
+
+def test_noise_and_saturation_follow_from_others():
+    """√μ_e.sat is 40 dB for 10⁴ e-; the threshold of 2.5 e- is 2 e- of noise and 1/2."""
+    sheet = DataSheet(
+        pixel_um=3.0, bits=16, qe_percent=50, gain_dn_per_e="6.0000", threshold_ph="5.0000", snr_max_db="40.0000"
+    )
+
+    assert sheet.value("saturation_e") == pytest.approx(1e4, rel=1e-4)
+    assert sheet.value("dark_noise_e") == pytest.approx(2.0, rel=1e-3)  # with 1 / (12 K²) of quantisation
+
+
+@pytest.mark.parametrize("prnu_fraction", [0.0, 0.01])
+def test_limit_has_its_highest_variance_at_the_saturation(prnu_fraction):
+    """Moments of Poisson-distributed charges that are cut at the limit, in the mean over sites."""
+    limit_e = limit_of_saturation(2000.0, prnu_fraction)
+    charges = np.arange(3000)
+    cut_e = np.minimum(charges, limit_e)
+    # Sites at equal shares of a normal distribution.
+    sites = stats.norm.ppf((np.arange(50) + 0.5) / 50) if prnu_fraction else np.zeros(1)
+    means_e = np.linspace(1960.0, 2040.0, 41)
+    variance = []
+    for mean_e in means_e:
+        shares = stats.poisson.pmf(charges, (mean_e * (1.0 + prnu_fraction * sites))[:, None])
+        variance.append(np.mean(shares @ cut_e**2 - (shares @ cut_e) ** 2))
+
+    assert means_e[int(np.argmax(variance))] == pytest.approx(2000.0, rel=0.006)
+
+
+def test_sites_scale_with_their_area():
+    """A site of four pixels has four times the full well and the dark current, and the read noise of a pixel."""
+    sheet = DataSheet(**PLAIN | {"dark_current_e_per_s": "10.0", "gain_dn_per_e": "0.3", "dsnu_e": "1.0"})
+    small, large = (
+        fs.Sensor.from_datasheet(fs.layout.grid(n_x=2, n_y=2, pitch_um=pitch_um), sheet) for pitch_um in (3.45, 6.9)
+    )
+
+    for name in ("full_well_e", "capacitance_f", "dark_e_per_s"):
+        np.testing.assert_allclose(getattr(large, name), 4.0 * getattr(small, name), rtol=1e-12)
+    assert large.read_noise_e == small.read_noise_e == 2.1
+
+
+def test_parameters_replace_those_of_the_sheet():
+    qe = fs.sensor.SiliconQE(depth_um=3.0)
+    sensor = fs.Sensor.from_datasheet(fs.layout.grid(4, 4, 3.45), DataSheet(**PLAIN), qe=qe, read_noise_e=5.0)
+
+    assert sensor.qe is qe
+    assert sensor.read_noise_e == 5.0
+
+
+def test_what_is_open_is_said():
+    assumed = " ".join(DataSheet(**PLAIN, wavelength_nm=529).assumptions)
+
+    for part in ("The gain is 0.38", "The black level is", "at 529 nm holds at all", "no DSNU", "no PRNU", "no dark"):
+        assert part in assumed
+    assert DataSheet(**SHEETS["imx900_high_gain"]).assumptions == (
+        "The quantum efficiency at 536 nm holds at all wavelengths.",
+        "The dark current doubles every 8 K.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"qe_percent": None}, "'qe_percent' must be in the data sheet, or follow from saturation_e and saturation_ph"),
+        ({"dark_noise_e": None}, "'dark_noise_e' must be in the data sheet, or follow from dark_noise_dn and gain"),
+        ({"saturation_e": None}, "'saturation_e' must be in the data sheet, or follow from saturation_ph and qe"),
+        ({"gain_dn_per_e": "2.70"}, "must be at most the last of 12 bits, 4,095 DN, got 28,080 DN; is K of other bits"),
+        ({"saturation_e": "wide"}, "'saturation_e' must be a number, without its unit, got 'wide'"),
+        ({"prnu_percent": "0.5 %"}, "without its unit"),
+        ({"qe_percent": 640}, "'qe_percent'"),
+        ({"bits": 12.5}, "'bits' must be an integer"),
+        (
+            {"gain_dn_per_e": "0.39", "dsnu_e": "1.0", "dsnu_dn": "1.0"},
+            "'dsnu_e' must agree with dsnu_dn / gain_dn_per_e",
+        ),
+        ({"snr_max_db": "60.2"}, "'saturation_e' must agree with the square of snr_max"),
+    ],
+)
+def test_wrong_sheets_are_explained(changes, message):
+    with pytest.raises(fs.errors.ParameterError) as caught:
+        DataSheet(**PLAIN | changes)
+    assert message in str(caught.value)
+
+
+def test_misprint_is_found():
+    with pytest.raises(fs.errors.ParameterError, match="'saturation_e' must agree with threshold_e x dynamic_range"):
+        DataSheet(**MISPRINTED)
+    DataSheet(**MISPRINTED | {"saturation_e": 20_800})
+
+
+def test_rounded_differences_are_reported():
+    """The sheet of a camera with 6,972 e- and 38.7 dB, the root of 7,413 e-."""
+    with pytest.warns(fs.errors.FoveasimWarning, match="'saturation_e' must agree with the square of snr_max"):
+        DataSheet(**PLAIN | {"saturation_e": 6972, "snr_max_db": "38.7"})
+
+
+def test_sheet_is_read_from_yaml(tmp_path):
+    path = tmp_path / "sheet.yaml"
+    path.write_text(yaml.safe_dump(SHEETS["imx900_low_gain"]))
+    layout = fs.layout.grid(4, 4, 2.25)
+
+    assert read_datasheet(path).value("gain_dn_per_e") == 0.399
+    assert fs.Sensor.from_datasheet(layout, path).read_noise_e == 5.56
+    path.write_text(yaml.safe_dump(PLAIN | {"dark_noise": 2.1}))
+    with pytest.raises(
+        fs.errors.ParameterError, match=r"'dark_noise' must be a quantity of a data sheet.*dark_noise_e"
+    ):
+        read_datasheet(path)
+    path.write_text(yaml.safe_dump({"bits": 12}))
+    with pytest.raises(fs.errors.ParameterError, match="'pixel_um' must be in the data sheet"):
+        read_datasheet(path)
+    with pytest.raises(fs.errors.ParameterError, match="'sheet' must be a DataSheet"):
+        fs.Sensor.from_datasheet(layout, 5)
