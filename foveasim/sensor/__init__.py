@@ -8,7 +8,6 @@ from types import MappingProxyType
 from foveasim._core.calls import Limits, declarations_of, publish
 from foveasim.sensor.budget import FIXED, TEMPORAL, NoiseBudget, noise_budget
 from foveasim.sensor.calibration import Calibration, calibrate, linearise
-from foveasim.sensor.datasheet import DataSheet, read_datasheet
 from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.shot import draw_shot_noise
 from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, non_destructive_reads
@@ -22,7 +21,8 @@ from foveasim.sensor.pixel_optics import (
     Outlines,
     PixelOptics,
 )
-from foveasim.sensor.presets import PRESETS, Preset
+from foveasim.sensor.published.datasheet import DataSheet, read_datasheet
+from foveasim.sensor.published.presets import PRESETS, Preset
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise
 from foveasim.sensor.spectral.curves import (

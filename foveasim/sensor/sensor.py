@@ -47,7 +47,6 @@ from foveasim.sensor.chain import (
     run_steps,
     sort_by_stage,
 )
-from foveasim.sensor.datasheet import DataSheet, read_datasheet
 from foveasim.sensor.device import Device
 from foveasim.sensor.effects import Collection, Effect, Photosites, Sites, Stage
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset
@@ -77,7 +76,8 @@ from foveasim.sensor.model.prediction import (
 )
 from foveasim.sensor.model.records import Record, light_records, map_light, readout_model
 from foveasim.sensor.pixel_optics import PixelOptics
-from foveasim.sensor.presets import find_preset
+from foveasim.sensor.published.datasheet import DataSheet, read_datasheet
+from foveasim.sensor.published.presets import find_preset
 from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
 from foveasim.sensor.spectral.response import FilterSet, rgb_filters
 from foveasim.units import electrons_to_volts, photon_energy_j

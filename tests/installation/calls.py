@@ -642,6 +642,9 @@ CALLS = {
         o.sensor, o.photo_e_per_s, [0.001, 0.002], seed=0
     ),
     "sensor.read_curve": lambda o: sensor.read_curve(o.text(".csv", "nm,R\n400,0.1\n700,0.2\n")),
+    "sensor.read_datasheet": lambda o: sensor.read_datasheet(
+        o.text(".yaml", "{pixel_um: 3, bits: 12, qe_percent: 60, dark_noise_e: 2, saturation_e: 9000}")
+    ),
     "sensor.read_filters": lambda o: sensor.read_filters(o.text(".csv", "nm,R,G\n400,0.1,0.2\n700,0.2,0.3\n")),
     "sensor.rgb_filters": lambda o: sensor.rgb_filters(),
     "sensor.signal_to_noise": lambda o: sensor.signal_to_noise(o.sensor, o.expected_e, 0.0 * o.expected_e),

@@ -124,6 +124,7 @@ def public_objects(directory):
         sensor.Rates(MANY, MANY, MANY), sensor.signal_to_noise(SENSOR, np.full(SITES.n_sites, 50.0), np.zeros(SITES.n_sites)),
         SENSOR.linearise(np.full(SITES.n_sites, 50.0)), SENSOR.invert(np.full(SITES.n_sites, 50)),
         sensor.SplineCurve(wavelength_nm=TABLE, value=CURVE.value), sensor.StepCurve(edge_nm=TABLE, value=(0.5,) * 199), CURVE,
+        sensor.DataSheet(pixel_um=3.45, bits=12, qe_percent=64, dark_noise_e=2.1, saturation_e=10_400),
         sensor.Calibration(**dict.fromkeys(("offset_dn", "gain", "read_noise_dn", "expected_dn"), MANY), **dict.fromkeys(("hot", "dead", "noisy", "clipped"), MANY < 0.0)),
         effects.ColumnOffset(0.1), effects.DarkSignal(0.1), effects.DeadSites(0.1), effects.HotSites(0.1, 10.0), effects.PhotoResponse(0.1),
         effects.PixelGain(0.1), effects.PixelOffset(0.1), effects.ReadNoise(MANY), effects.ResetNoise(300.0), effects.ShotNoise(), SENSOR.sites,

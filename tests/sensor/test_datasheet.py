@@ -8,7 +8,7 @@ from scipy import stats
 
 import foveasim as fs
 from foveasim.sensor import DataSheet, read_datasheet
-from foveasim.sensor.datasheet import _range_of, limit_of_saturation
+from foveasim.sensor.published.datasheet import _range_of, limit_of_saturation
 
 #: A sheet with the quantities that a sensor needs.
 PLAIN = {"pixel_um": 3.45, "bits": 12, "qe_percent": 64, "dark_noise_e": "2.1", "saturation_e": 10_400}
@@ -69,7 +69,7 @@ def test_measurement_returns_the_sheet(name):
         assert low - tolerance <= value <= high + tolerance, (quantity, printed[quantity], value)
 
 
-def test_implied_values_are_those_of_a_complete_sheet():
+def test_implied_values_are_those_of_sheet():
     """Five values of the IMX900 imply the others, which its sheet prints."""
     complete = SHEETS["imx900_low_gain"]
     given = ("pixel_um", "bits", "qe_percent", "gain_dn_per_e", "dark_noise_e", "saturation_e")
@@ -93,7 +93,7 @@ def test_noise_and_saturation_follow_from_others():
 
 
 @pytest.mark.parametrize("prnu_fraction", [0.0, 0.01])
-def test_limit_has_its_highest_variance_at_the_saturation(prnu_fraction):
+def test_variance_is_highest_at_the_saturation(prnu_fraction):
     """Moments of Poisson-distributed charges that are cut at the limit, in the mean over sites."""
     limit_e = limit_of_saturation(2000.0, prnu_fraction)
     charges = np.arange(3000)

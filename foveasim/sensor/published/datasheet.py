@@ -1,5 +1,5 @@
 """
-Data sheets in the terms of EMVA 1288: their values, what follows from them, and whether they agree.
+Data sheets in the terms of EMVA 1288: values, what they imply, and contradictions.
 
 Symbols and equations are those of EMVA Standard 1288, Release 4.0 Linear (https://www.emva.org/standards-technology/emva-1288/):
 with the quantum efficiency η, the system gain K in DN/e-, the temporal dark noise σ_d in e- and the quantisation noise of
@@ -13,7 +13,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple
@@ -24,6 +23,7 @@ from scipy import optimize, special
 from foveasim._core.calls import Limits
 from foveasim._core.names import did_you_mean
 from foveasim._core.quantities import format_quantity
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_count, check_number, read_only
 from foveasim.errors import FoveasimWarning, ParameterError, warn
 from foveasim.sensor.adc import BITS, QUANTISATION_DN2
@@ -260,7 +260,7 @@ class DataSheet:
 
     @property
     def assumptions(self) -> tuple[str, ...]:
-        """Sentences about what the data sheet leaves open, with the values that a sensor has, and why."""
+        """Sentences about what the data sheet leaves open, with the values of a sensor."""
         found = []
         if "gain_dn_per_e" not in self._ranges:
             found.append(f"The gain is {self.gain:.4g} DN/e-: the codes end where the saturation requires it.")
@@ -278,14 +278,14 @@ class DataSheet:
 
     @cached_property
     def gain(self) -> float:
-        """System gain K, DN/e-; without one in the data sheet, that whose codes end where the saturation requires it."""
+        """System gain K, DN/e-; by default, the codes end where the saturation requires it."""
         known = self._ranges.get("gain_dn_per_e")
         full_well_e = limit_of_saturation(self.value("saturation_e"), self._prnu)
         return self._codes / full_well_e if known is None else known.middle
 
     @cached_property
     def black_dn(self) -> int:
-        """Black level, DN; without one in the data sheet, a multiple of the noise of dark frames for which codes are left."""
+        """Black level, DN; by default, a multiple of the noise of dark frames."""
         ranges = self._ranges
         if "black_level_dn" in ranges:
             return round(ranges["black_level_dn"].middle)
@@ -352,7 +352,8 @@ class DataSheet:
     @cached_property
     def _solution(self) -> tuple[dict[str, Range], dict[str, str]]:
         """Return all quantities, and how those follow that are not printed."""
-        found, derived = dict(self._printed), {}
+        found = dict(self._printed)
+        derived: dict[str, str] = {}
         while True:
             new = next((each for each in RELATIONS if each.name not in found and found.keys() >= {*each.others}), None)
             if new is None:
@@ -364,7 +365,7 @@ class DataSheet:
         return self._solution[0]
 
     def _contradictions(self) -> Iterator[tuple[str, str, float]]:
-        """Yield the printed values that differ from what others imply: name, sentence, relative difference."""
+        """Yield printed values that contradict others: name, sentence, relative difference."""
         seen: set[frozenset[str]] = set()
         for relation in RELATIONS:
             names = frozenset((relation.name, *relation.others))
@@ -457,19 +458,19 @@ def read_datasheet(path: str | Path) -> DataSheet:
 
 
 def limit_of_saturation(saturation_e: float, prnu_fraction: float = 0.0) -> float:
-    """Return the charge that limits sites whose mean temporal variance is highest at a mean, e-."""
+    """Return the limit of charges whose temporal variance is highest at a mean, e-."""
     spread_e = math.sqrt(saturation_e) + prnu_fraction * saturation_e
     low, high = saturation_e - spread_e, saturation_e + 12.0 * spread_e
     return float(optimize.brentq(lambda limit_e: _slope(saturation_e, limit_e, prnu_fraction), low, high))
 
 
 def saturation_of_limit(limit_e: float, prnu_fraction: float = 0.0) -> float:
-    """Return the mean of the highest temporal variance for a limit, e-: the inverse of :func:`limit_of_saturation`."""
+    """Return the mean of the highest temporal variance for a limit, e-."""
     return float(optimize.brentq(lambda mean_e: _slope(mean_e, limit_e, prnu_fraction), 0.3 * limit_e, limit_e))
 
 
 def _slope(mean_e: float, limit_e: float, prnu_fraction: float) -> float:
-    """Return the derivative of the variance of limited charges with respect to their mean, over the sites of a sensor."""
+    """Return the derivative of the variance of limited charges by their mean."""
     factor = np.maximum(1.0 + prnu_fraction * NODES, 1e-3)
     own_e = mean_e * factor
     z = (limit_e - own_e) / np.sqrt(own_e)
@@ -481,7 +482,7 @@ def _slope(mean_e: float, limit_e: float, prnu_fraction: float) -> float:
 
 
 def _follows(relation: Relation, known: Mapping[str, Range]) -> Range:
-    """Return the range of a quantity for those of the others: of the corners, since functions are monotonic."""
+    """Return the range of a quantity for the ranges of others; functions are monotonic."""
     corners = [relation.function(*each) for each in itertools.product(*(known[name] for name in relation.others))]
     return Range(min(corners), max(corners))
 
