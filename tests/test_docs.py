@@ -72,7 +72,8 @@ SMALLER = {
     "cheat_sheet": {"n_sites=4096": "n_sites=1024"},
     "comparing": {"n_sites=4096": "n_sites=961"},
     "tutorial": {"n_sites=4096": "n_sites=1024"},
-    "layouts": {"640": "64", "480": "48", "n_sites=14_000": "n_sites=1369"},
+    "layouts": {"n_sites=14_000": "n_sites=1369"},
+    "layout_files": {"640": "64", "480": "48"},
 }
 
 
