@@ -64,35 +64,6 @@ def test_sites_saturate_at_the_same_irradiance():
     assert levels[first[largest]] == pytest.approx(2809.0, rel=3e-3)
 
 
-def test_sheet_gives_sensor_that_measures_it():
-    text = (DOCS / "questions.md").read_text()
-    (code,) = re.findall(r"```python\n(def from_sheet.*?)```", text, re.DOTALL)
-    names = {"fs": fs}
-    exec(code, names)
-    sheet = {"saturation_e": 10_500.0, "noise_e": 2.4, "dsnu_e": 1.5, "prnu_fraction": 0.006, "qe": 0.6, "bits": 12}
-    n_side, n_dark, n_half = 200, 40, 40
-    sensor = names["from_sheet"](fs.layout.grid(n_side, n_side, 3.45), p=16, **sheet)
-    levels_e = np.concatenate((np.linspace(500.0, 4500.0, 5), [5250.0], np.linspace(6000.0, 12_000.0, 61)))
-    frames = [
-        fs.metrics.draw_frames(
-            sensor, sensor.light_response() * level_e, n_frames=n_half if level_e == 5250.0 else 2, seed=k
-        )
-        for k, level_e in enumerate(levels_e)
-    ]
-    dark = [fs.metrics.draw_frames(sensor, np.zeros(n_side**2), n_frames=n_dark, seed=99)]
-    found = fs.metrics.emva1288(frames, dark, levels_e / sheet["qe"])
-
-    # Standard errors: 1 / sqrt(2 n) of a standard deviation, 1.5 % for the gain from five levels of two frames.
-    assert found.gain_dn_per_e == pytest.approx((2**12 - 16) / 10_500.0, rel=0.01)
-    assert found.qe == pytest.approx(sheet["qe"], rel=0.01)
-    noise_e = found.dark_noise_dn / found.gain_dn_per_e
-    assert noise_e == pytest.approx(sheet["noise_e"], rel=0.02)
-    assert found.dsnu_e == pytest.approx(sheet["dsnu_e"], rel=0.03)
-    assert found.prnu_fraction == pytest.approx(sheet["prnu_fraction"], rel=0.03)
-    # The variance is highest about 2 standard deviations of the shot noise below the end of the range.
-    assert found.saturation_ph * sheet["qe"] == pytest.approx(10_500.0, abs=4.0 * 10_500.0**0.5)
-
-
 def test_volumes_are_those_of_a_part():
     assert states("guides/viewing.md", 'solids.volumes_um3("wells"), solids.fill_factor')
     solids = fs.view.solids(ZONES, fs.view.SensorStack(well_depth_um=3.0, trench_width_um=0.0))
