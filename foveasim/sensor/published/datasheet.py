@@ -41,9 +41,9 @@ ROUND_FRACTION = 0.005
 MAX_FRACTION = 0.25
 #: Signal at an SNR of 1 without dark noise, e- (the approximation of the standard).
 THRESHOLD_E = 0.5
-#: Nodes and weights of means over a standard normal distribution.
-NODES, WEIGHTS = (read_only(each) for each in np.polynomial.hermite_e.hermegauss(41))
-WEIGHTS = read_only(WEIGHTS / WEIGHTS.sum())
+#: Nodes of means over a standard normal distribution, so dense that sites reach their limit one after the other, and weights.
+NODES = read_only(np.linspace(-5.0, 5.0, 2001))
+WEIGHTS = read_only(np.exp(-0.5 * NODES**2) / np.exp(-0.5 * NODES**2).sum())
 #: Quantities that a sensor needs; without a gain, the codes end at the saturation.
 NEEDED = ("qe_percent", "dark_noise_e", "saturation_e")
 
@@ -59,8 +59,8 @@ QUANTITIES: Mapping[str, Limits] = MappingProxyType(
         "dark_noise_dn": Limits(above=0.0, at_most=1e5),
         "threshold_ph": Limits(above=0.0, at_most=1e7),
         "threshold_e": Limits(above=0.0, at_most=1e7),
-        "saturation_ph": Limits(above=0.0, at_most=1e10),
-        "saturation_e": Limits(above=0.0, at_most=1e10),
+        "saturation_ph": Limits(above=0.0, low=10.0, at_most=1e8),
+        "saturation_e": Limits(above=0.0, low=10.0, at_most=1e8),
         "snr_max_db": Limits(above=0.0, at_most=200.0, hint="in dB: 20 log10 of the ratio"),
         "dynamic_range_db": Limits(above=0.0, at_most=200.0, hint="in dB: 20 log10 of the ratio; a bit is 6.02 dB"),
         "dsnu_e": Limits(at_least=0.0, at_most=1e6),
@@ -459,14 +459,14 @@ def read_datasheet(path: str | Path) -> DataSheet:
 
 def limit_of_saturation(saturation_e: float, prnu_fraction: float = 0.0) -> float:
     """Return the limit of charges whose temporal variance is highest at a mean, e-."""
-    spread_e = math.sqrt(saturation_e) + prnu_fraction * saturation_e
-    low, high = saturation_e - spread_e, saturation_e + 12.0 * spread_e
-    return float(optimize.brentq(lambda limit_e: _slope(saturation_e, limit_e, prnu_fraction), low, high))
+    high_e = saturation_e + 12.0 * (math.sqrt(saturation_e) + prnu_fraction * saturation_e)
+    return float(optimize.brentq(lambda limit_e: _slope(saturation_e, limit_e, prnu_fraction), saturation_e, high_e))
 
 
 def saturation_of_limit(limit_e: float, prnu_fraction: float = 0.0) -> float:
     """Return the mean of the highest temporal variance for a limit, e-."""
-    return float(optimize.brentq(lambda mean_e: _slope(mean_e, limit_e, prnu_fraction), 0.3 * limit_e, limit_e))
+    low_e = limit_e / (1.0 + 12.0 * (1.0 / math.sqrt(limit_e) + prnu_fraction))
+    return float(optimize.brentq(lambda mean_e: _slope(mean_e, limit_e, prnu_fraction), low_e, limit_e))
 
 
 def _slope(mean_e: float, limit_e: float, prnu_fraction: float) -> float:
@@ -513,7 +513,7 @@ def _difference(name: str, own: Range, implied: Range) -> float:
     first, second = own.middle, implied.middle
     if name.endswith("_db"):
         first, second = _ratio(first), _ratio(second)
-    return abs(math.log(first / second))
+    return abs(first - second) / max(first, second)
 
 
 def _shown(value: float) -> str:
