@@ -55,6 +55,7 @@ MISSING = {
     "renderer": renderer_is_missing,
     "chromium": chromium_is_missing,
     **{module: partial(is_missing, module) for module in ("deepinv", "torch", "torchvision")},
+    "aedat": lambda: None if find_spec("aedat") else "no aedat",
 }
 
 

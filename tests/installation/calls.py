@@ -325,6 +325,12 @@ LENGTH = np.array([1.0, 2.0])
 TRIANGLE = [[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]]
 SQUARE = shapely.box(-3.0, -3.0, 3.0, 3.0)
 POINT = [[0.1, 0.2]]
+#: A drawing of one square in µm.
+SQUARE_DXF = (
+    "0 SECTION 2 HEADER 9 $ACADVER 1 AC1015 9 $INSUNITS 70 13 0 ENDSEC 0 SECTION 2 ENTITIES "
+    "0 LWPOLYLINE 5 1F 100 AcDbEntity 8 0 100 AcDbPolyline 90 4 70 1 10 0 20 0 10 4 20 0 10 4 20 4 10 0 20 4 "
+    "0 ENDSEC 0 EOF "
+).replace(" ", "\n")
 #: Bundled layout with the fewest sites.
 BUNDLED = "prima_75"
 #: Names relative to the package, and functions of :class:`Objects`.
@@ -512,6 +518,7 @@ CALLS = {
     "layout.random_channels": lambda o: layout.random_channels(o.plain, [0.5, 0.5], seed=0),
     "layout.read_layer_map": lambda o: layout.read_layer_map(o.text(".yaml", "photosite: 10/0\nwell: 20/0\n")),
     "layout.read_layout": lambda o: layout.read_layout(o.written(".npz", o.layout.write)),
+    "layout.read_layout dxf": lambda o: layout.read_layout(o.text(".dxf", SQUARE_DXF)),
     "layout.readout_by": lambda o: layout.readout_by(layout.grid(3, 3, 2.0), "row"),
     "layout.readout_order": lambda o: layout.readout_order(o.plain),
     "layout.remove_at": lambda o: layout.remove_at(o.plain, POINT),
@@ -581,6 +588,7 @@ CALLS = {
     "metrics.wave_vectors_per_mm": lambda o: metrics.wave_vectors_per_mm([1.0, 2.0]),
     "modes.write_events": lambda o: modes.write_events([o.events], o.path(".h5")),
     "modes.Events.read": lambda o: modes.Events.read(o.written(".txt", o.events.save), o.events.layout),
+    "modes.Events.read aedat": lambda o: modes.Events.read(o.text(".aedat4", "#!AER-DAT4.0\r\n"), o.events.layout),
     "modes.Events.save": lambda o: modes.Events.load(o.written(".npz", o.events.save)),
     "modes.Events.save h5": lambda o: modes.Events.load(o.written(".h5", o.events.save)),
     "optics.circular_otf": lambda o: optics.circular_otf([0.0, 0.5]),

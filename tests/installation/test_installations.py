@@ -19,7 +19,7 @@ pytestmark = pytest.mark.nightly(group="installations")
 #: Extras with modules that the package imports.
 EXTRAS = sorted(set(EXTRA_OF.values()))
 #: Libraries of extras that the environment of the tests may lack.
-BEYOND_DEV = {"adapters": ("deepinv", "torchvision"), "learn": ("torch",)}
+BEYOND_DEV = {"adapters": ("deepinv", "torchvision"), "events": ("aedat",), "learn": ("torch",)}
 MODULES = (
     "", "compare", "config", "distortion", "explore", "layout", "learn", "maps", "metrics", "modes", "optics", "reconstruct",
     "scene", "scene.charts", "sensor", "sensor.effects", "studio", "testing", "tiles", "units", "video", "view",

@@ -155,8 +155,8 @@ def from_sizes(
     ... )
     >>> layout.n_sites, layout.provenance["parameters"]["r_max_um"]
     (8059, 1800.0)
-    >>> round(layout.size_um.min(), 1)
-    13.1
+    >>> round(float(layout.size_um.min()), 1)
+    8.4
     """
     check_choice("generator", generator, sizable())
     if size_um is not None:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import optimize, special
@@ -26,7 +26,7 @@ from foveasim._core.quantities import format_quantity
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_count, check_number, read_only
 from foveasim.errors import FoveasimWarning, ParameterError, warn
-from foveasim.sensor.adc import BITS, QUANTISATION_DN2
+from foveasim.sensor.adc import QUANTISATION_DN2
 from foveasim.units import ELEMENTARY_CHARGE_C
 
 __all__ = ["DataSheet", "read_datasheet"]
@@ -196,14 +196,14 @@ class DataSheet:
     ...     dark_noise_e="6.8",
     ...     saturation_e=32700,
     ... )
-    >>> sheet.value("dynamic_range_db"), sheet.derived["dynamic_range_db"]
+    >>> round(sheet.value("dynamic_range_db"), 1), sheet.derived["dynamic_range_db"]
     (72.5, 'saturation_e / threshold_e')
     """
 
     title: str = ""
     source: str = ""
     pixel_um: float | str
-    bits: Annotated[int, BITS]
+    bits: int
     qe_percent: float | str | None = None
     wavelength_nm: float | str | None = None
     gain_dn_per_e: float | str | None = None
