@@ -33,6 +33,7 @@ from foveasim.metrics.photon_transfer import (
     slopes,
 )
 from foveasim.sensor.adc import QUANTISATION_DN2
+from foveasim.sensor.published.datasheet import THRESHOLD_E
 
 __all__ = ["Emva1288", "emva1288"]
 
@@ -44,8 +45,6 @@ PRNU_FRACTION = 0.5
 MAX_UNDERFLOW_FRACTION = 0.005
 #: Largest number of blocks of sites of the jackknife: Student's distribution is then nearly Gaussian.
 N_BLOCKS = 100
-#: Signal at an SNR of 1 without dark noise, e- (the standard's approximation).
-THRESHOLD_E = 0.5
 #: Minimum number of points of a straight-line fit: exposures for the dark current, levels for the linearity error.
 MIN_POINTS = 3
 

@@ -79,6 +79,7 @@ def test_installed_generators_have_sizes(monkeypatch):
         ({"n_sites": 100}, "not determined"),
         ({"generator": "spiral"}, "'generator' must be one of"),
         ({"size_um": (0.0, 5.0)}, "'size_um'"),
+        ({"size_um": 3.0}, "'size_um' must be"),
         ({"size_um": FORMAT_UM, "pitch_um": 3.0}, "'pitch_um' of grid must be left out: it follows from the sizes"),
         ({"size_um": FORMAT_UM, "n_x": 3}, "'n_x' of grid must be left out"),
         ({"size_um": FORMAT_UM, "stager": True}, "did you mean 'stagger'?"),

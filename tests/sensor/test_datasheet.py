@@ -151,6 +151,10 @@ def test_what_is_open_is_said():
         ({"prnu_percent": "0.5 %"}, "without its unit"),
         ({"qe_percent": 640}, "'qe_percent'"),
         ({"bits": 12.5}, "'bits' must be an integer"),
+        ({"bits": 1}, "'black_level_dn' must be below the last code of 1 bits, 1"),
+        ({"black_level_dn": 4095}, "'black_level_dn' must be below the last code of 12 bits, 4095"),
+        ({"qe_percent": None, "saturation_ph": 1000}, "'qe_percent' must be <= 100"),
+        ({"saturation_e": None, "snr_max_db": "3.0"}, "'saturation_e' must be from 10 to 1e+08"),
         (
             {"gain_dn_per_e": "0.39", "dsnu_e": "1.0", "dsnu_dn": "1.0"},
             "'dsnu_e' must agree with dsnu_dn / gain_dn_per_e",

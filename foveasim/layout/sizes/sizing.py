@@ -111,7 +111,7 @@ SIZES: Mapping[str, Sizes] = MappingProxyType(
 def from_sizes(
     generator: str,
     *,
-    size_um: Sequence[float] | None = None,
+    size_um: tuple[float, float] | None = None,
     n_sites: Annotated[int, SITES] | None = None,
     min_size_um: Annotated[float, LENGTH] | None = None,
     **parameters: Any,
@@ -159,8 +159,8 @@ def from_sizes(
     8.4
     """
     check_choice("generator", generator, sizable())
-    if size_um is not None:
-        size_um = [check_length_um("size_um", each_um) for each_um in size_um]
+    for side_um in size_um or ():
+        check_length_um("size_um", side_um)
     follows = {*initial_parameters(generator), *_unknowns(generator), *(SIZES.get(generator, Sizes()).replaced or ())}
     for name, value in parameters.items():
         if name in follows or name.endswith(SUFFIX):

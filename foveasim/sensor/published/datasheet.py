@@ -27,12 +27,11 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_count, check_number, read_only
 from foveasim.errors import FoveasimWarning, ParameterError, warn
 from foveasim.sensor.adc import QUANTISATION_DN2
+from foveasim.sensor.published.presets import SWING_V
 from foveasim.units import ELEMENTARY_CHARGE_C
 
 __all__ = ["DataSheet", "read_datasheet"]
 
-#: Voltage range of the sensors: only its product with the capacitance matters.
-SWING_V = 1.0
 #: Black level of a sensor without one in its data sheet, in standard deviations of dark frames.
 BLACK_SIGMA = 5
 #: Largest relative rounding of a whole number that ends in zeros, which may be exact or not.
@@ -230,6 +229,11 @@ class DataSheet:
             if name not in self._ranges:
                 ways = [" and ".join(each.others) for each in RELATIONS if each.name == name]
                 raise ParameterError(name, f"must be in the data sheet, or follow from {' or from '.join(ways)}")
+        for name in self._ranges:  # values that follow may be impossible, too
+            QUANTITIES[name].check(name, self.value(name))
+        if self._codes < 1:
+            rule = f"must be below the last code of {self.bits} bits, {2**self.bits - 1}"
+            raise ParameterError("black_level_dn", rule, self.black_dn)
         for name, text, fraction in self._contradictions():
             if fraction > MAX_FRACTION:
                 raise ParameterError(name, text)
@@ -265,9 +269,7 @@ class DataSheet:
         if "gain_dn_per_e" not in self._ranges:
             found.append(f"The gain is {self.gain:.4g} DN/e-: the codes end where the saturation requires it.")
         if self.black_level_dn is None:
-            found.append(
-                f"The black level is {self.black_dn} DN, {BLACK_SIGMA} times the noise of dark frames, which is not clipped."
-            )
+            found.append(f"The black level is {self.black_dn} DN, up to {BLACK_SIGMA} times the noise of dark frames.")
         if self.wavelength_nm is not None:
             found.append(f"The quantum efficiency at {self.value('wavelength_nm'):g} nm holds at all wavelengths.")
         reached_e = saturation_of_limit(self._codes / self.gain, self._prnu)
