@@ -175,6 +175,8 @@ _OF_ARRAYS = ("axis", "channels")
 _EXCLUDED = ("density_grid",)
 _CROSSTALK: dict[str, Callable[..., Any]] = {"diffusion": Diffusion, "kernel": KernelCrosstalk}
 _PerSite = float | PerArea | list[float]
+#: Parameters of effects with one value for all sites, or one for each.
+_EFFECT_TYPES: dict[str, Any] = dict.fromkeys(("response_fraction", "offset_e", "step_e"), float | list[float])
 
 
 def _check_exposure(value: float | str) -> float | str:
@@ -356,7 +358,7 @@ def _sensor() -> type[Section]:
             lambda section: "filter file" if isinstance(section, dict) and "path" in section else "filter set"
         ),
     ]
-    effects = _registered_sections(EFFECTS)
+    effects = _registered_sections(EFFECTS, **_EFFECT_TYPES)
     pixel_optics = _registered_sections(
         PIXEL_OPTICS, skip=("opening", "photodiode"), design_chief_ray=_model("design chief ray", ChiefRayTable) | None
     )

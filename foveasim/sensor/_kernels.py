@@ -310,7 +310,7 @@ def _charge_at_code(value, site, adc):
             else:
                 high = fraction
     v = (fraction * v_sat_v - output_v) / scale
-    if nonlinearity > 0.0 and v > 0.0:
+    if nonlinearity != 0.0 and v > 0.0:
         v = (
             0.5 * v_sat_v * (1.0 - math.sqrt(1.0 - 4.0 * nonlinearity * v / v_sat_v)) / nonlinearity
             if v < v_sat_v * (1.0 - nonlinearity)

@@ -162,7 +162,8 @@ class Sensor:
     gain_fpn_fraction : float
         Gain FPN: standard deviation over mean of the conversion gain, a Gaussian distribution.
     nonlinearity_fraction : float
-        Response nonlinearity: relative voltage loss at V_sat; the loss grows with the square of the voltage.
+        Response nonlinearity: relative voltage loss at V_sat; the loss grows with the square of the voltage. Negative for
+        a response that rises above the straight line.
     pedestal_v : float, V
         Black level added to all voltages, so that noise of dark frames is not clipped at code 0. Less than ``v_sat_v``.
     pixel_fpn_fraction, line_fpn_fraction : float
@@ -231,7 +232,7 @@ class Sensor:
     ] = None
     gain_fpn_fraction: Annotated[float, SPREAD] = 0.0
     nonlinearity_fraction: Annotated[
-        float, Limits(at_least=0.0, at_most=0.5, hint="above 0.5 the voltage would decrease with charge")
+        float, Limits(low=-0.5, at_most=0.5, hint="above 0.5 the voltage would decrease with charge"), Usual(0.0, 0.1)
     ] = 0.0
     pedestal_v: Annotated[float, VOLTS] = 0.0
     pixel_fpn_fraction: Annotated[float, OFFSET, Usual(0.0, 0.1)] = 0.0

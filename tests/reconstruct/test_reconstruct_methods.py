@@ -557,8 +557,15 @@ def test_dark_signal_and_pedestal_are_subtracted():
 
 @pytest.mark.parametrize(
     "parameters",
-    [{}, {"companding": "root"}, {"companding": "log"}, {"nonlinearity_fraction": 0.2}, {"pedestal_v": 0.1}],
-    ids=["linear", "root", "log", "nonlinear", "pedestal"],
+    [
+        {},
+        {"companding": "root"},
+        {"companding": "log"},
+        {"nonlinearity_fraction": 0.2},
+        {"nonlinearity_fraction": -0.1},
+        {"pedestal_v": 0.1},
+    ],
+    ids=["linear", "root", "log", "nonlinear", "rising", "pedestal"],
 )
 def test_photoelectrons_estimated_from_code_unbiased(parameters):
     layout = fs.layout.grid(n_x=50, n_y=40, pitch_um=2.0)

@@ -114,6 +114,7 @@ def test_prediction_with_all_effects_matches_draws(bits, companding):
         {"companding": "table", "companding_table": [0.0, 0.7, 1.0], "read_noise_e": 3.0},
         {"inl_dn": [0.0, 3.0, 0.0], "read_noise_e": 3.0},
         {"nonlinearity_fraction": 0.5, "read_noise_e": 3.0},
+        {"nonlinearity_fraction": -0.2, "read_noise_e": 3.0},
         {"rts_fraction": 1.0, "rts_e": 30.0},
     ],
     ids=str,

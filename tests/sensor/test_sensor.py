@@ -305,8 +305,15 @@ def test_every_code_occurs_at_its_centre(bits):
 @pytest.mark.parametrize("read_noise_e", [0.0, 3.0])
 @pytest.mark.parametrize(
     "adc",
-    [{}, {"companding": "root"}, {"companding": "log"}, {"nonlinearity_fraction": 0.05}, {"inl_dn": (0.0, 1.5, -40.0)}],
-    ids=["linear", "root", "log", "nonlinear", "inl"],
+    [
+        {},
+        {"companding": "root"},
+        {"companding": "log"},
+        {"nonlinearity_fraction": 0.05},
+        {"nonlinearity_fraction": -0.1},
+        {"inl_dn": (0.0, 1.5, -40.0)},
+    ],
+    ids=["linear", "root", "log", "nonlinear", "rising", "inl"],
 )
 def test_prediction_of_saturated_sites_is_certain(adc, read_noise_e):
     sensor = Sensor(MANY[:100], bits=10, capacitance_f=1e-15, read_noise_e=read_noise_e, **adc)

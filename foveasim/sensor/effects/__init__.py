@@ -37,6 +37,7 @@ from foveasim.sensor.effects.crosstalk import (
 )
 from foveasim.sensor.effects.dark import DarkLaw, DarkSignal, HotSites, dark_current_factor
 from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
+from foveasim.sensor.effects.measured import ColumnNoise, OffsetMap, ResponseMap, RowNoise, TelegraphMap
 from foveasim.sensor.effects.readout import ReadNoise, ResetNoise, TelegraphNoise
 from foveasim.sensor.effects.shot import ShotNoise, draw_shot_noise
 
@@ -46,6 +47,7 @@ __all__ = [
     "STANDARD",
     "AdditiveNoise",
     "Collection",
+    "ColumnNoise",
     "ColumnOffset",
     "CrosstalkOperator",
     "DarkLaw",
@@ -60,6 +62,7 @@ __all__ = [
     "InterPixelCapacitance",
     "KernelCrosstalk",
     "Mixing",
+    "OffsetMap",
     "PhotoResponse",
     "Photosites",
     "PixelGain",
@@ -67,10 +70,13 @@ __all__ = [
     "Reach",
     "ReadNoise",
     "ResetNoise",
+    "ResponseMap",
+    "RowNoise",
     "ShotNoise",
     "Sites",
     "Stage",
     "StepModel",
+    "TelegraphMap",
     "TelegraphNoise",
     "dark_current_factor",
     "draw_shot_noise",
