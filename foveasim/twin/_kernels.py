@@ -1,0 +1,30 @@
+"""Numba kernels of twins: sums over the frames of a stack."""
+
+from __future__ import annotations
+
+from numba import types
+
+from foveasim._core.jit import njit
+
+_codes = [types.Array(kind, 3, "C", readonly=True) for kind in (types.uint8, types.uint16)]
+_sums = types.int64[:, ::1]
+
+
+@njit([types.void(codes, _sums, _sums, _sums, _sums) for codes in _codes])
+def add_frames(codes, sums, squares, rows, columns):
+    """
+    Add codes (n_frame, n_y, n_x) to sums and squares (n_y, n_x), and to sums of rows and columns of each frame.
+
+    ``rows`` (n_frame, n_y) and ``columns`` (n_frame, n_x). Rows of a frame are next to each other in memory, so that sums of
+    one row stay in the cache for all frames.
+    """
+    for y in range(codes.shape[1]):
+        for k in range(codes.shape[0]):
+            total = types.int64(0)
+            for x in range(codes.shape[2]):
+                value = types.int64(codes[k, y, x])
+                total += value
+                sums[y, x] += value
+                squares[y, x] += value * value
+                columns[k, x] += value
+            rows[k, y] += total

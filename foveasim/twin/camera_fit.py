@@ -1,0 +1,192 @@
+"""Fit of a sensor to the frames of a camera."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.calls import Limits, OwnCheck
+from foveasim._io.npz import read_archive, write_archive
+from foveasim.errors import FoveasimError, FoveasimWarning, ParameterError, warn
+from foveasim.sensor.adc import BITS, LOG_STRENGTH, Companding
+from foveasim.twin.fitting import StackLight, fit_statistics
+from foveasim.twin.result import Twin, twin_of
+from foveasim.twin.stacks import Stack, read_stacks
+from foveasim.twin.statistics import StackStatistics, StackSums, sum_frames
+
+__all__ = ["fit"]
+
+PIXEL = Limits(above=0.0, low=0.1, at_most=1e3, hint="the side of a pixel, in µm")
+#: Largest fraction of dark codes that are 0 (EMVA 1288).
+MAX_ZERO_FRACTION = 0.005
+
+
+def fit(
+    frames: OwnCheck[str | Path | Sequence[Stack]],
+    *,
+    bits: Annotated[int, BITS],
+    pixel_um: Annotated[float, PIXEL],
+    mosaic: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None,
+    companding: Companding = "linear",
+    log_strength: Annotated[float, LOG_STRENGTH] = 100.0,
+    companding_table: Sequence[float] | None = None,
+    inl_dn: Sequence[float] = (),
+    resume: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Twin:
+    """
+    Estimate the parameters of a camera from dark and uniformly illuminated frames.
+
+    Parameters
+    ----------
+    frames : path, or list of Stack
+        Folder of stacks (:func:`read_stacks`), or the stacks. Needed are dark frames, and some levels of light up to
+        saturation, each of two frames or more; better are 16 frames of 10 levels, 64 dark frames of the shortest exposure, and
+        dark frames of two longer exposures.
+    bits : int
+        Bits of the codes, without the empty ones of their files.
+    pixel_um : float, µm
+        Side of a pixel.
+    mosaic : {"RGGB", "BGGR", "GRBG", "GBRG"}, optional
+        Colours of the first two rows of the frames.
+    companding, log_strength, companding_table, inl_dn
+        Transfer function of the ADC, if it is not linear: see :class:`foveasim.sensor.adc.ADC`.
+    resume : path, optional
+        Directory for the sums of stacks that have been read, from which an interrupted fit continues.
+    progress : callable, optional
+        Called with the number of stacks that have been read, and of all.
+
+    Returns
+    -------
+    Twin
+
+    Raises
+    ------
+    ParameterError
+        When stacks have different sizes, fewer than two frames, or codes above those of ``bits``; without dark frames, or
+        without levels of light.
+    FileError
+        When a file cannot be read.
+
+    Warns
+    -----
+    FoveasimWarning
+        When more than 0.5 % of the dark codes are 0, which biases noise and black level.
+
+    Notes
+    -----
+    Means and variances of the levels are those of the sensor's chain (:meth:`foveasim.Sensor.predict`), with quantisation,
+    companding, clipping, nonlinearity and the nonuniformity of the pixels; the parameters maximise their likelihood. RTS noise
+    is a mixture of noncentral chi-square distributions of the variances of pixels, the dark current a log-normal distribution.
+    Intervals contain differences between blocks of rows. They do not contain errors that all frames share, such as a light
+    that drifts with the exposure time.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> layout = fs.layout.grid(n_x=64, n_y=48, pitch_um=3.0)
+    >>> camera = fs.Sensor(
+    ...     layout,
+    ...     bits=12,
+    ...     v_sat_v=1.0,
+    ...     capacitance_f=1.6e-15,
+    ...     read_noise_e=5.0,
+    ...     pedestal_v=0.02,
+    ... )
+    >>> def frames(signal_e, seed):
+    ...     codes = fs.metrics.draw_frames(
+    ...         camera, np.full(layout.n_sites, signal_e), n_frames=8, seed=seed
+    ...     )
+    ...     return codes.reshape(8, 48, 64)
+    >>> stacks = [fs.twin.Stack(frames(0.0, 9), exposure_s=0.01, light=0)]
+    >>> stacks += [
+    ...     fs.twin.Stack(frames(1000.0 * k, k), exposure_s=0.01 * k, light=1)
+    ...     for k in range(1, 9)
+    ... ]
+    >>> twin = fs.twin.fit(stacks, bits=12, pixel_um=3.0)
+    >>> round(twin.estimates["read_noise_e"].value, 1)
+    5.0
+    >>> twin.sensor().bits
+    12
+    """
+    stacks = read_stacks(frames) if isinstance(frames, str | Path) else list(frames)
+    if not stacks or not all(isinstance(each, Stack) for each in stacks):
+        raise ParameterError("frames", "must be a folder, or a list of foveasim.twin.Stack objects")
+    adc: dict[str, Any] = {"companding": companding}
+    if companding == "log":
+        adc["log_strength"] = log_strength
+    if companding_table is not None:
+        adc["companding_table"] = [float(each) for each in companding_table]
+    if len(inl_dn):
+        adc["inl_dn"] = [float(each) for each in inl_dn]
+    names = [each.name or f"stack {k}" for k, each in enumerate(stacks)]
+    statistics = []
+    for k, (name, stack) in enumerate(zip(names, stacks, strict=True)):
+        statistics.append(_statistics(name, stack, bits, None if resume is None else Path(resume)))
+        if statistics[k].shape != statistics[0].shape:
+            shapes = [f"{n_x} x {n_y} pixels" for n_y, n_x in (statistics[0].shape, statistics[k].shape)]
+            raise ParameterError(
+                "frames", f"must have the same size, but {names[0]} has {shapes[0]} and {name} {shapes[1]}"
+            )
+        if progress is not None:
+            progress(k + 1, len(stacks))
+    lights = [StackLight(each.exposure_s, each.light, each.photons, each.temperature_k) for each in stacks]
+    known = {"bits": bits, **adc}
+    return twin_of(fit_statistics(statistics, lights, known, mosaic), names, pixel_um, {**known, "mosaic": mosaic})
+
+
+def _statistics(name: str, stack: Stack, bits: int, resume: Path | None) -> StackStatistics:
+    """Return the statistics of a stack, from sums that are stored if its files did not change."""
+    path = None if resume is None else _sums_path(resume, stack)
+    if path is not None and path.is_file():
+        try:
+            _, arrays = read_archive(path)
+            return StackStatistics.of(StackSums(*(arrays[each] for each in ("sums", "squares", "rows", "columns"))))
+        except (FoveasimError, KeyError, ValueError, OSError):
+            path.unlink()
+    total = sum_frames(name, _checked(name, stack, bits))
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrays = {each: getattr(total, each) for each in ("sums", "squares", "rows", "columns")}
+        write_archive(path, {}, arrays, is_compressed=False)
+    return StackStatistics.of(total)
+
+
+def _checked(name: str, stack: Stack, bits: int) -> Iterator[NDArray[Any]]:
+    """Yield the frames of a stack, after comparing their codes with the bits."""
+    n_codes, n_zeros, n_pixels = 2**bits, 0, 0
+    for k, frame in enumerate(stack):
+        if frame.size and frame.max() >= n_codes:
+            shift = next((s for s in range(16, 0, -1) if not np.any(frame.astype(np.int64) % 2**s)), 0)
+            hint = f"; its codes are multiples of {2**shift}: divide them by it" if shift else ""
+            raise ParameterError(
+                "bits",
+                f"must be those of the codes: {name}, frame {k}, has the code {int(frame.max())}, above {bits} bits{hint}",
+            )
+        n_zeros += int(np.count_nonzero(frame == 0))
+        n_pixels += frame.size
+        yield frame
+    if stack.is_dark and n_pixels and n_zeros > MAX_ZERO_FRACTION * n_pixels:
+        warn(
+            f"{100.0 * n_zeros / n_pixels:.2g} % of the codes of {name} are 0: the black level is too low, and noise and "
+            "offsets are biased; increase the black level of the camera",
+            FoveasimWarning,
+        )
+
+
+def _sums_path(resume: Path, stack: Stack) -> Path | None:
+    """Return the file for the sums of a stack of files, which depends on their names, sizes and times; None for arrays."""
+    if isinstance(stack.frames, np.ndarray) or not all(isinstance(each, str | Path) for each in stack.frames):
+        return None
+    states = []
+    for each in stack.frames:
+        status = Path(each).stat()
+        states.append((str(Path(each).resolve()), status.st_size, status.st_mtime_ns))
+    return resume / f"{hashlib.sha256(json.dumps(states).encode()).hexdigest()[:24]}.npz"

@@ -1,0 +1,146 @@
+"""Means and variances of levels by the sensor chain, for the parameters of a fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import ndtri
+
+from foveasim._core.threads import cached_property
+from foveasim._core.validation import Floats
+from foveasim.layout.generators.grid import grid
+from foveasim.sensor import Sensor
+from foveasim.sensor.effects.measured import OffsetMap
+from foveasim.units import ELEMENTARY_CHARGE_C
+
+__all__ = ["Chain", "Spread"]
+
+#: Range of the ADC, V: only its product with the capacitance matters.
+SWING_V = 1.0
+#: Pixels that represent all: a lattice of rank 1, whose responses, offsets and dark currents are equally probable each, and the
+#: steps of the lattice with the smallest correlations.
+N_PIXELS, LATTICE = 31, (1, 22, 10)
+#: Relative difference of spreads up to which they have the same effect.
+SAME_SPREAD = 0.02
+#: Largest nonlinearity in a search.
+MAX_BEND = 0.45
+#: Standard deviations of the charge below the full well from which it matters, and a full well that does not, e-.
+MARGIN_SIGMAS, LARGEST_E = 12.0, 1e12
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Standard deviations over pixels: of response and dark current over their means, and of offsets, e-."""
+
+    response_fraction: float = 0.0
+    offset_e: float = 0.0
+    dark_fraction: float = 0.0
+
+    def is_close(self, other: Spread) -> bool:
+        """Whether another spread has nearly the same effect."""
+        mine, others = ((each.response_fraction, each.offset_e, each.dark_fraction) for each in (self, other))
+        return bool(np.allclose(mine, others, rtol=SAME_SPREAD))
+
+    @cached_property
+    def pixels(self) -> tuple[Floats, Floats, Floats]:
+        """Responses, offsets in e- and factors of the dark current of pixels that represent all, (n,) each."""
+        if not (self.response_fraction or self.offset_e or self.dark_fraction):
+            return np.ones(1), np.zeros(1), np.ones(1)
+        normal = ndtri((np.multiply.outer(LATTICE, np.arange(N_PIXELS)) % N_PIXELS + 0.5) / N_PIXELS)
+        response, offset, dark = normal / normal.std(axis=1, keepdims=True)
+        sigma = math.sqrt(math.log1p(self.dark_fraction**2))
+        factor = np.exp(sigma * dark)
+        return np.maximum(1.0 + self.response_fraction * response, 0.0), self.offset_e * offset, factor / factor.mean()
+
+
+class Moments(NamedTuple):
+    """
+    Moments of codes at several levels.
+
+    ``mean_dn``, ``variance_dn2``, ``slope_dn_per_e`` (n_level,): in the mean over pixels; the slope is that of the mean code by
+    the charge. ``of_pixels`` (2 n_level, n): means, then variances, of pixels that represent all.
+    """
+
+    mean_dn: Floats
+    variance_dn2: Floats
+    slope_dn_per_e: Floats
+    of_pixels: Floats
+
+    @property
+    def statistics(self) -> Floats:
+        """Means, then variances, (2 n_level,)."""
+        return np.concatenate((self.mean_dn, self.variance_dn2))
+
+    def sampling(self) -> Floats:
+        """Return the covariance of the statistics of one pixel by what differs between pixels, (2 n_level, 2 n_level)."""
+        off = self.of_pixels - self.of_pixels.mean(axis=1, keepdims=True)
+        return np.asarray(off @ off.T / off.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """
+    Chain of a sensor for pixels at several levels.
+
+    ``known``: parameters of :class:`foveasim.Sensor` that are known, such as ``bits`` and ``companding``.
+    """
+
+    known: Mapping[str, Any]
+    n_levels: int
+    spread: Spread = Spread()
+
+    @cached_property
+    def _layouts(self) -> dict[int, Any]:
+        """Layouts of the numbers of pixels so far."""
+        return {}
+
+    @property
+    def n_codes(self) -> int:
+        """Number of codes."""
+        return int(2 ** self.known["bits"])
+
+    def parameters(self, values: Mapping[str, float]) -> dict[str, Any]:
+        """Return parameters of a sensor for those of a fit."""
+        return dict(self.known) | {
+            "capacitance_f": self.n_codes * ELEMENTARY_CHARGE_C / (values["gain_dn_per_e"] * SWING_V),
+            "v_sat_v": SWING_V,
+            "pedestal_v": SWING_V * max(values["black_level_dn"] + 0.5, 0.0) / self.n_codes,
+            "read_noise_e": math.sqrt(max(values["read_noise_e2"], 0.0)),
+            "nonlinearity_fraction": min(max(values.get("nonlinearity_fraction", 0.0), -MAX_BEND), MAX_BEND),
+        }
+
+    def moments(self, values: Mapping[str, float], light_e: Floats, dark_e: Floats) -> Moments:
+        """Return the moments of codes for charges of light and dark current, (n_level,) e- each."""
+        responses, offset_e, factors = self.spread.pixels
+        signed_e = (np.outer(light_e, responses) + np.outer(dark_e, factors)).ravel()
+        offsets_e, well_e = np.tile(offset_e, self.n_levels), values.get("full_well_e", math.inf)
+        index, share, well = np.arange(signed_e.size), np.ones(signed_e.size), np.full(signed_e.size, LARGEST_E)
+        is_near = signed_e + MARGIN_SIGMAS * np.sqrt(np.maximum(signed_e, 1.0)) > well_e
+        if is_near.any():
+            # Charges are whole electrons, and full wells, too: between two of them, moments are interpolated.
+            near, fraction = np.flatnonzero(is_near), well_e - math.floor(well_e)
+            index, share = np.concatenate((index, near)), np.concatenate((share, np.full(near.size, fraction)))
+            share[near], well[near] = 1.0 - fraction, math.floor(well_e)
+            well = np.concatenate((well, np.full(near.size, math.floor(well_e) + 1.0)))
+        signed_e = signed_e[index]
+        charge_e = np.maximum(signed_e, 0.0)
+        if charge_e.size not in self._layouts:
+            self._layouts[charge_e.size] = grid(n_x=charge_e.size, n_y=1, pitch_um=1.0)
+        effects = [OffsetMap(offsets_e[index])] if np.any(offset_e) else []
+        parameters = self.parameters(values) | {"full_well_e": well}
+        sensor = Sensor(self._layouts[charge_e.size], effects=effects, **parameters)
+        mean, variance = sensor.predict(charge_e)
+        slope = np.broadcast_to(sensor.linearise(charge_e).gain_dn_per_e, charge_e.size)
+        # Estimates of a dark current or a noise of 0 are negative for half of the devices: moments continue as straight lines.
+        mean = mean + slope * (signed_e - charge_e)
+        variance = variance + slope**2 * (signed_e - charge_e + min(values["read_noise_e2"], 0.0))
+        means, variances, slopes = (
+            np.bincount(index, share * each).reshape(self.n_levels, -1) for each in (mean, variance, slope)
+        )
+        return Moments(
+            means.mean(axis=1), variances.mean(axis=1), slopes.mean(axis=1), np.concatenate((means, variances))
+        )

@@ -1,0 +1,112 @@
+"""Pooled statistics of stacks: mean and variance of each class of pixels, in blocks of rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from foveasim._core.threads import cached_property
+from foveasim._core.validation import Floats, Ints
+from foveasim.twin.statistics import MAX_BLOCKS, StackStatistics
+
+__all__ = ["Levels", "block_means", "block_weights", "class_index", "row_blocks"]
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """
+    Mean and variance over frames of each stack and class: a level.
+
+    Attributes
+    ----------
+    stack, class_of_level : (n_level,) int
+        Stack and class of pixels of each level.
+    n_frames, n_pixels : (n_level,) int
+    means_dn, variances_dn2 : (n_level, n_block) float64, DN and DN²
+        Means over the pixels of each block of rows; variances of pixels, without what rows, columns and frames share.
+    common_dn2 : (n_level,) float64, DN²
+        Variance that rows, columns and frames share.
+    mean_noise_dn2 : (n_level,) float64, DN²
+        Variance of the mean over all pixels and frames due to temporal noise.
+    weights : (n_block,) float64
+        Fractions of the pixels.
+    """
+
+    stack: Ints
+    class_of_level: Ints
+    n_frames: Ints
+    n_pixels: Ints
+    means_dn: Floats
+    variances_dn2: Floats
+    common_dn2: Floats
+    mean_noise_dn2: Floats
+    weights: Floats
+
+    @cached_property
+    def mean_dn(self) -> Floats:
+        """Mean code, (n_level,) DN."""
+        return self.means_dn @ self.weights
+
+    @cached_property
+    def variance_dn2(self) -> Floats:
+        """Variance of pixels over frames, (n_level,) DN²."""
+        return self.variances_dn2 @ self.weights
+
+    @classmethod
+    def of(cls, stacks: list[StackStatistics], classes: Ints, share: Floats | float = 1.0) -> Levels:
+        """
+        Return the levels of stacks for classes of pixels, (n_y, n_x) int from 0, or -1 for none.
+
+        ``share`` (n_y, n_x): weights of pixels.
+        """
+        weights = block_weights(classes)
+        rows: dict[str, list[Any]] = {each.name: [] for each in fields(cls) if each.name != "weights"}
+        n_pixels = np.bincount(classes[classes >= 0])
+        for k, each in enumerate(stacks):
+            common_dn2 = each.common_dn2()
+            means = block_means(each.mean_dn, classes, share)
+            variances = block_means(each.variance_dn2 - common_dn2[:, None], classes, share)
+            noise_dn2 = each.frame_variance_dn2() / each.n_frames
+            for c, (mean, variance) in enumerate(zip(means, variances, strict=True)):
+                found = k, c, each.n_frames, n_pixels[c], mean, variance, common_dn2.mean(), noise_dn2
+                for name, value in zip(rows, found, strict=True):
+                    rows[name].append(value)
+        return cls(**{name: np.array(each) for name, each in rows.items()}, weights=weights)
+
+
+def _blocks(classes: Ints) -> Ints:
+    return row_blocks(classes.shape[0], unit=2 if classes.max() else 1)
+
+
+def block_weights(classes: Ints) -> Floats:
+    """Return the fractions of the pixels in each block, (n_block,)."""
+    blocks = _blocks(classes)
+    return np.bincount(blocks) / blocks.size
+
+
+def block_means(values: Floats, classes: Ints, share: Floats | float = 1.0) -> Floats:
+    """Return the means of values of pixels over each class and block, (n_class, n_block), with weights of the pixels."""
+    blocks = _blocks(classes)
+    found = []
+    for c in range(int(classes.max()) + 1):
+        weights = np.where(classes == c, share, 0.0)
+        totals = np.bincount(blocks, (weights * values).sum(axis=1))
+        found.append(totals / np.maximum(np.bincount(blocks, weights.sum(axis=1)), 1e-300))
+    return np.array(found)
+
+
+def row_blocks(n_y: int, *, unit: int = 1) -> Ints:
+    """Return the block of each row, (n_y,), of equal numbers of ``unit`` rows."""
+    n_units = n_y // unit
+    n_blocks = max(1, min(MAX_BLOCKS, n_units // 2))
+    of_unit = np.arange(n_units) * n_blocks // n_units
+    return np.minimum(np.repeat(of_unit, unit)[np.minimum(np.arange(n_y), n_units * unit - 1)], n_blocks - 1)
+
+
+def class_index(n_y: int, n_x: int, mosaic: str | None) -> Ints:
+    """Return the class of each pixel, (n_y, n_x): 0, or the position in a mosaic of 2 x 2."""
+    if mosaic is None:
+        return np.zeros((n_y, n_x), np.int64)
+    return (np.arange(n_y)[:, None] % 2) * 2 + np.arange(n_x) % 2

@@ -1,0 +1,302 @@
+"""
+Fit of the chain to means and variances of levels, by maximum likelihood.
+
+Means and variances over many pixels and frames are Gaussian, and independent of each other for Gaussian noise: the likelihood
+is that of weighted squares, with the moments of the chain (:meth:`foveasim.Sensor.predict`), and weights by the variances that it
+predicts. Weights follow the parameters (iteratively reweighted), so that the equations of the estimate are unbiased.
+
+Uncertainties come from the differences between blocks of rows, through the linear map from the statistics to the estimate (the
+"sandwich"): they include what differs between pixels, and correlations, of any distribution.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from foveasim._core.validation import Bools, Floats
+from foveasim.twin.chain import Chain, Moments
+from foveasim.twin.levels import Levels
+
+__all__ = ["Exposures", "PooledFit", "fit_levels"]
+
+#: Relative step of numerical derivatives, largest change of a logarithm in one iteration, largest number of iterations, and
+#: decrease of the sum of squares that ends them.
+STEP, MAX_CHANGE, MAX_ITERATIONS, TOLERANCE = 1e-4, 0.7, 40, 1e-3
+#: Parameters whose logarithms are fitted.
+POSITIVE = ("gain_dn_per_e", "full_well_e", "qe", "light_e_per_s", "dark_doubling_k", "level_e")
+WELL, BEND = "full_well_e", "nonlinearity_fraction"
+#: Powers of the gain that turn parameters into codes.
+EXPONENTS = {WELL: 1, "qe": 1, "light_e_per_s": 1, "dark_e_per_s": 1, "read_noise_e2": 2}
+#: Damping of the first iteration, and its largest value.
+DAMPING, MAX_DAMPING = 1e-3, 1e8
+#: Smallest variance for weights, DN².
+SMALLEST_DN2 = 1e-4
+#: Noise of means in weights, as a fraction of codes: the chain's rounding.
+MEAN_FLOOR_DN = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Exposures:
+    """
+    What is known of the light of each level.
+
+    ``exposure_s`` (n_level,). ``light`` (n_level,): photons, or relative light times seconds; 0 in the dark, NaN if unknown.
+    ``light_parameter`` (n_level,): name of the parameter that it multiplies. ``temperature_k`` (n_level,), or NaN.
+    """
+
+    exposure_s: Floats
+    light: Floats
+    light_parameter: tuple[str, ...]
+    temperature_k: Floats
+
+    @property
+    def is_dark(self) -> Bools:
+        """Levels without light."""
+        return np.asarray(self.light == 0.0)
+
+    @property
+    def is_free(self) -> Bools:
+        """Levels of unknown light."""
+        return np.isnan(self.light)
+
+
+@dataclass(frozen=True, eq=False)
+class PooledFit:
+    """
+    Parameters of the chain, with the linear map from statistics to them.
+
+    ``names`` and ``values``: parameters, then charges of levels of unknown light. ``means_dn``, ``variances_dn2``,
+    ``slopes_dn_per_e``, ``light_e`` (n_level,): of the chain. ``covariance``: over devices of the kind. ``own_covariance``: of
+    this device, by temporal noise alone; both of the fitted variables, logarithms for positive ones.
+    """
+
+    names: tuple[str, ...]
+    values: Mapping[str, float]
+    means_dn: Floats
+    variances_dn2: Floats
+    slopes_dn_per_e: Floats
+    light_e: Floats
+    covariance: Floats
+    own_covariance: Floats
+    residuals: Floats = field(default_factory=lambda: np.zeros(0))
+
+    def error(self, name: str, *, of_device: bool = False) -> float:
+        """Return the standard error of a parameter; of a logarithm for positive ones."""
+        matrix = self.own_covariance if of_device else self.covariance
+        k = self.names.index(name)
+        return math.sqrt(max(float(matrix[k, k]), 0.0))
+
+
+def fit_levels(
+    chain: Chain,
+    levels: Levels,
+    exposures: Exposures,
+    start: Mapping[str, float],
+    start_e: Floats,
+    *,
+    fixed_e: Floats,
+    variance_error_dn2: Floats,
+) -> PooledFit:
+    """
+    Return the parameters that explain the levels best.
+
+    ``start``: first values of all parameters that are fitted. ``start_e`` (n_level,): first charges of levels of unknown light.
+    ``fixed_e`` (n_level,): charges of levels whose light cannot be determined, or NaN. ``variance_error_dn2`` (n_level,):
+    standard error of the variance of a level where it does not follow from the blocks, or NaN.
+    """
+    model = _Model(chain, levels, exposures, tuple(start), start_e, fixed_e)
+    vector = model.pack(start)
+    damping = DAMPING
+    moments = model.moments(vector)
+    whiten = model.whitening(moments)
+    residual = whiten(model.residual(moments))
+    for _ in range(MAX_ITERATIONS):
+        jacobian = whiten(model.jacobian(vector, moments.statistics))
+        normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+        diagonal = np.diag(normal).copy()
+        diagonal[diagonal <= 0.0] = 1.0
+        before = float(residual @ residual)
+        after = math.inf
+        while damping < MAX_DAMPING:
+            change = np.linalg.solve(normal + damping * np.diag(diagonal), gradient)
+            change *= min(1.0, MAX_CHANGE / max(float(np.abs(change[model.is_log]).max(initial=0.0)), 1e-300))
+            proposed = model.moments(vector + change)
+            new = model.residual(proposed)
+            after = float((whiten(new) ** 2).sum()) if np.isfinite(new).all() else math.inf
+            if after < before:
+                break
+            damping = max(damping, 1e-6) * 10.0
+        if after >= before:
+            break
+        vector, damping, moments = vector + change, damping / 10.0, proposed
+        whiten = model.whitening(moments)
+        residual = whiten(model.residual(moments))
+        if before - after < TOLERANCE * max(1.0, after / residual.size):
+            break
+    return model.result(vector, variance_error_dn2)
+
+
+@dataclass(eq=False)
+class _Model:
+    """Residuals of the statistics and their derivatives by the fitted variables."""
+
+    chain: Chain
+    levels: Levels
+    exposures: Exposures
+    names: tuple[str, ...]
+    start_e: Floats
+    fixed_e: Floats
+
+    def __post_init__(self) -> None:
+        self.free = np.flatnonzero(self.exposures.is_free & np.isnan(self.fixed_e))
+        positive = [any(name.startswith(each) for each in POSITIVE) for name in self.names]
+        self.is_log = np.array([*positive, *[True] * self.free.size])
+
+    def pack(self, values: Mapping[str, float]) -> Floats:
+        """
+        Return the vector of fitted variables: signals in codes instead of charges, and logarithms of positive ones.
+
+        Means are known much better than the gain: as functions of signals they do not depend on it, so that the valley of the
+        likelihood is straight.
+        """
+        gain = values["gain_dn_per_e"]
+        found = np.array([*(values[name] for name in self.names), *self.start_e[self.free]], np.float64)
+        found *= self._powers(gain)
+        if WELL in self.names:
+            k = self.names.index(WELL)
+            relative = found[k] / self.chain.n_codes
+            found[k] *= 1.0 - values.get(BEND, 0.0) * relative
+        return np.where(self.is_log, np.log(np.where(self.is_log, np.maximum(found, 1e-12), 1.0)), found)
+
+    def _powers(self, gain: float) -> Floats:
+        """Return the factors of charges, and of their squares, to codes."""
+        exponents = [EXPONENTS.get(name.partition("_of_class_")[0], 0) for name in self.names]
+        return gain ** np.array([*exponents, *[1] * self.free.size], np.float64)
+
+    def unpack(self, vector: Floats) -> tuple[dict[str, float], Floats]:
+        """Return the parameters, and the charges of levels of unknown light."""
+        found = np.where(self.is_log, np.exp(np.minimum(vector, 40.0)), vector)
+        gain = float(found[self.names.index("gain_dn_per_e")])
+        if WELL in self.names:
+            k = self.names.index(WELL)
+            bend = float(found[self.names.index(BEND)]) if BEND in self.names else 0.0
+            relative = found[k] / self.chain.n_codes
+            found[k] *= 2.0 / (1.0 + math.sqrt(max(1.0 - 4.0 * bend * relative, 0.0)))
+        found = found / self._powers(gain)
+        n = len(self.names)
+        return dict(zip(self.names, found[:n].tolist(), strict=True)), found[n:]
+
+    def reported(self, vector: Floats) -> Floats:
+        """Return the parameters and charges, logarithms of positive ones."""
+        values, free_e = self.unpack(vector)
+        found = np.array([*values.values(), *free_e])
+        return np.where(self.is_log, np.log(np.where(self.is_log, np.maximum(found, 1e-300), 1.0)), found)
+
+    def charges(self, vector: Floats) -> tuple[dict[str, float], Floats, Floats]:
+        """Return the parameters, and charges of light and of dark current, (n_level,) e-."""
+        values, free_e = self.unpack(vector)
+        light_e = np.array(
+            [
+                0.0 if amount == 0.0 or np.isnan(amount) else amount * values[name]
+                for amount, name in zip(self.exposures.light, self.exposures.light_parameter, strict=True)
+            ]
+        )
+        light_e[self.free] = free_e
+        is_fixed = ~np.isnan(self.fixed_e)
+        light_e[is_fixed] = self.fixed_e[is_fixed]
+        dark_e = values.get("dark_e_per_s", 0.0) * self.exposures.exposure_s
+        if "dark_doubling_k" in values:
+            reference_k = np.nanmin(self.exposures.temperature_k)
+            dark_e = dark_e * 2.0 ** ((self.exposures.temperature_k - reference_k) / values["dark_doubling_k"])
+        return values, light_e, dark_e
+
+    def moments(self, vector: Floats) -> Moments:
+        """Return the moments of the levels."""
+        return self.chain.moments(*self.charges(vector))
+
+    def residual(self, moments: Moments) -> Floats:
+        """Return measured less expected statistics."""
+        return np.concatenate((self.levels.mean_dn, self.levels.variance_dn2)) - moments.statistics
+
+    def noise(self, moments: Moments) -> Floats:
+        """Return the variances of the statistics by temporal noise."""
+        variance = np.maximum(moments.variance_dn2, SMALLEST_DN2)
+        # Gaussian noise, and two codes where there is no other: s⁴ has the variance 2 V², and V (1 - 4 V).
+        of_pixel = 2.0 * variance**2 + np.maximum(variance * (1.0 - 4.0 * variance), 0.0)
+        of_variance = of_pixel / (self.levels.n_pixels * (self.levels.n_frames - 1))
+        return np.concatenate((self.levels.mean_noise_dn2 + MEAN_FLOOR_DN**2, of_variance))
+
+    def whitening(self, moments: Moments) -> Callable[[Floats], Floats]:
+        """Return the map to uncorrelated statistics of variance 1: by temporal noise, and the responses of the pixels."""
+        from scipy.linalg import solve_triangular
+
+        matrix = moments.sampling() / np.tile(self.levels.n_pixels, 2)
+        matrix[np.diag_indices_from(matrix)] += self.noise(moments)
+        scale = np.sqrt(np.diag(matrix))
+        factor = np.linalg.cholesky(matrix / np.multiply.outer(scale, scale))
+        return lambda values: np.asarray(solve_triangular(factor, (values.T / scale).T, lower=True))
+
+    def jacobian(self, vector: Floats, at: Floats) -> Floats:
+        """Return the derivatives of the statistics, which are ``at``; charges of levels are changed all at once."""
+        n_levels, n = self.levels.mean_dn.size, len(self.names)
+        found = np.zeros((2 * n_levels, vector.size))
+
+        def change(step: Floats) -> Floats:
+            return self.moments(vector + step).statistics - at
+
+        for k in range(n):
+            step = np.zeros(vector.size)
+            step[k] = STEP if self.is_log[k] else self._step(self.names[k], vector)
+            found[:, k] = change(step) / step[k]
+        if self.free.size:
+            step = np.zeros(vector.size)
+            step[n:] = STEP
+            of_all = change(step) / STEP
+            for j, level in enumerate(self.free):
+                found[(level, n_levels + level), n + j] = of_all[[level, n_levels + level]]
+        return found
+
+    def _step(self, name: str, vector: Floats) -> float:
+        value = float(vector[self.names.index(name)])
+        if name == "read_noise_e2":
+            return max(abs(value), 0.1) * 1e-2
+        if name == "dark_e_per_s":
+            return max(abs(value) * 1e-3, 1e-2 / float(self.exposures.exposure_s.max()))
+        return {"black_level_dn": 1e-2, BEND: 1e-4}[name]
+
+    def result(self, vector: Floats, variance_error_dn2: Floats) -> PooledFit:
+        """Return the fit with its covariances."""
+        levels, moments = self.levels, self.moments(vector)
+        whiten, noise = self.whitening(moments), self.noise(moments)
+        jacobian = whiten(self.jacobian(vector, moments.statistics))
+        to_vector = (
+            np.linalg.pinv(jacobian.T @ jacobian, hermitian=True, rcond=1e-12) @ jacobian.T @ whiten(np.eye(noise.size))
+        )
+        to_reported = np.empty((vector.size, vector.size))
+        for k, step in enumerate(1e-5 * np.eye(vector.size)):
+            to_reported[:, k] = (self.reported(vector + step) - self.reported(vector - step)) / 2e-5
+        to_vector = to_reported @ to_vector
+        of_blocks = np.concatenate((levels.means_dn, levels.variances_dn2))
+        off = of_blocks - (of_blocks @ levels.weights)[:, None]
+        known = np.flatnonzero(~np.isnan(variance_error_dn2)) + levels.mean_dn.size
+        off[known] = 0.0
+        n_blocks = levels.weights.size
+        over_blocks = (off * levels.weights**2) @ off.T * n_blocks / max(n_blocks - 1, 1)
+        over_blocks[known, known] = variance_error_dn2[known - levels.mean_dn.size] ** 2
+        values, free_e = self.unpack(vector)
+        values |= {f"level_e_{k}": float(value) for k, value in zip(self.free, free_e, strict=True)}
+        return PooledFit(
+            names=(*self.names, *(f"level_e_{k}" for k in self.free)),
+            values=values,
+            means_dn=moments.mean_dn,
+            variances_dn2=moments.variance_dn2,
+            slopes_dn_per_e=moments.slope_dn_per_e,
+            light_e=self.charges(vector)[1],
+            covariance=to_vector @ over_blocks @ to_vector.T,
+            own_covariance=(to_vector * noise) @ to_vector.T,
+            residuals=whiten(self.residual(moments)),
+        )

@@ -1,0 +1,189 @@
+"""
+Statistics of stacks of frames: what a fit needs of them, computed in one pass.
+
+With the codes of n frames of M rows and N columns, the deviations from the mean image are those of frames, rows, columns and
+pixels (analysis of variance). Their mean squares are unbiased: with the variances of pixels σ², rows ρ² and columns γ² in a
+frame, the mean square of rows is σ² + N ρ², that of columns σ² + M γ².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.threads import cached_property
+from foveasim._core.validation import Floats, Ints
+from foveasim.errors import ParameterError
+
+__all__ = ["StackStatistics", "StackSums", "sum_frames"]
+
+#: Largest number of blocks of rows, whose differences give the uncertainty of statistics.
+MAX_BLOCKS = 64
+#: Probability of a difference between frames below which it is real, such as flicker of the light.
+MAX_PROBABILITY = 1e-3
+#: Frames that are added at once, while a row of sums stays in the cache.
+BATCH = 8
+
+
+@dataclass(eq=False)
+class StackSums:
+    """Sums over the frames of a stack: (n_y, n_x) int64, and those of rows and columns, (n_frame, n_y) and (n_frame, n_x)."""
+
+    sums: Ints
+    squares: Ints
+    rows: Ints
+    columns: Ints
+
+
+def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
+    """
+    Return the sums over frames of codes, (n_y, n_x) uint8 or uint16 each, which are read once.
+
+    Raises ParameterError when there are fewer than two frames, of different sizes, or of other numbers.
+    """
+    from foveasim.twin import _kernels
+
+    batch: list[NDArray[Any]] = []
+    total: StackSums | None = None
+    rows, columns = [], []
+
+    def add() -> None:
+        codes = np.ascontiguousarray(np.stack(batch))
+        assert total is not None
+        of_rows, of_columns = (np.zeros((len(batch), n), np.int64) for n in codes.shape[1:])
+        _kernels.add_frames(codes, total.sums, total.squares, of_rows, of_columns)
+        rows.append(of_rows)
+        columns.append(of_columns)
+        batch.clear()
+
+    for k, frame in enumerate(frames):
+        codes = check_frame(f"{name}, frame {k}", frame)
+        if total is None:
+            zeros = np.zeros(codes.shape, np.int64)
+            total = StackSums(zeros, zeros.copy(), zeros[:0], zeros[:0])
+        elif codes.shape != total.sums.shape:
+            raise ParameterError(
+                "frames",
+                f"must have the same size, but {name} has frames of {_size(total.sums.shape)} and {_size(codes.shape)}",
+            )
+        if batch and batch[0].dtype != codes.dtype:
+            add()
+        batch.append(codes)
+        if len(batch) == BATCH:
+            add()
+    if batch:
+        add()
+    if total is None or (n_frames := sum(map(len, rows))) < 2:
+        raise ParameterError(
+            "frames",
+            f"must be at least two per stack, but {name} has {0 if total is None else n_frames}: noise is their difference",
+        )
+    total.rows, total.columns = np.concatenate(rows), np.concatenate(columns)
+    return total
+
+
+def check_frame(name: str, frame: Any) -> NDArray[Any]:
+    """Return a frame as uint8 or uint16 (n_y, n_x), after validation."""
+    codes = np.asarray(frame)
+    if codes.ndim != 2 or min(codes.shape) < 1:
+        raise ParameterError("frames", f"must be (n_y, n_x) codes, but {name} has the shape {codes.shape}")
+    if codes.dtype in (np.uint8, np.uint16):
+        return codes
+    if (
+        codes.dtype.kind not in "iuf"
+        or not np.array_equal(codes, np.rint(codes))
+        or codes.min() < 0
+        or codes.max() > 65535
+    ):
+        raise ParameterError(
+            "frames",
+            f"must contain raw codes, whole numbers from 0 to 65,535, but {name} does not: fit frames before any processing",
+        )
+    return codes.astype(np.uint16)
+
+
+def _size(shape: Sequence[int]) -> str:
+    return f"{shape[1]} x {shape[0]} pixels"
+
+
+@dataclass(frozen=True, eq=False)
+class StackStatistics:
+    """
+    Means and variances of the codes of a stack.
+
+    Attributes
+    ----------
+    n_frames : int
+    mean_dn : (n_y, n_x) float64, DN
+        Mean over frames; row 0 is that of the frames.
+    variance_dn2 : (n_y, n_x) float64, DN²
+        Sample variance over frames.
+    row_dn, column_dn : (n_frame, n_y) and (n_frame, n_x) float64, DN
+        Deviations of rows and columns of each frame from their mean over frames.
+    """
+
+    n_frames: int
+    mean_dn: Floats
+    variance_dn2: Floats
+    row_dn: Floats
+    column_dn: Floats
+
+    @classmethod
+    def of(cls, total: StackSums) -> StackStatistics:
+        """Return the statistics of sums."""
+        n, (n_y, n_x) = len(total.rows), total.sums.shape
+        variance = (n * total.squares - total.sums**2) / float(n * (n - 1))
+        return cls(
+            n,
+            total.sums / n,
+            variance,
+            *(each / m - (each / m).mean(axis=0) for each, m in ((total.rows, n_x), (total.columns, n_y))),
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        n_y, n_x = self.mean_dn.shape
+        return n_y, n_x
+
+    @cached_property
+    def frame_dn(self) -> Floats:
+        """Deviations of frames from their mean, (n_frame,) DN."""
+        return np.asarray(self.row_dn.mean(axis=1))
+
+    @cached_property
+    def mean_squares_dn2(self) -> dict[str, float]:
+        """Mean squares of rows, columns and pixels, DN², without the common deviations of frames."""
+        (n_y, n_x), n = self.shape, self.n_frames
+        frame = self.frame_dn[:, None]
+        row = n_x * float(((self.row_dn - frame) ** 2).sum())
+        column = n_y * float(((self.column_dn - frame) ** 2).sum())
+        total = (n - 1) * float(self.variance_dn2.sum()) - n_y * n_x * float((frame**2).sum())
+        degrees = {"row": (n - 1) * (n_y - 1), "column": (n - 1) * (n_x - 1)}
+        degrees["pixel"] = (n - 1) * (n_y - 1) * (n_x - 1)
+        found = {"row": row, "column": column, "pixel": total - row - column}
+        return {name: found[name] / max(degrees[name], 1) for name in found}
+
+    def common_dn2(self) -> Floats:
+        """Return the part of the variance of all pixels that rows, columns and frames share, for each row, (n_y,) DN²."""
+        (n_y, n_x), n = self.shape, self.n_frames
+        mean_dn2 = self.variance_dn2.mean(axis=1)
+        rows_dn2 = (self.row_dn**2).sum(axis=0) / (n - 1)
+        columns_dn2 = float(((self.column_dn - self.frame_dn[:, None]) ** 2).sum()) / ((n - 1) * n_x)
+        # Means of rows and columns contain the noise of pixels, too.
+        pixel_dn2 = (mean_dn2 - rows_dn2 - columns_dn2) / (1.0 - 1.0 / n_x - (n_x - 1.0) / (n_x * n_y))
+        return np.asarray(mean_dn2 - pixel_dn2)
+
+    def frame_variance_dn2(self) -> float:
+        """Return the variance of the mean of a frame, DN²: by pixels, rows and columns, or more if frames differ more."""
+        from scipy.special import chdtrc
+
+        squares = self.mean_squares_dn2
+        own = (squares["row"] + max(squares["column"] - squares["pixel"], 0.0)) / self.mean_dn.size
+        found = float(self.frame_dn.var(ddof=1))
+        degrees = self.n_frames - 1
+        return found if chdtrc(degrees, degrees * found / max(own, 1e-300)) < MAX_PROBABILITY else own
