@@ -176,7 +176,11 @@ class DeviationTable:
                 gains.append(slopes("frames", signal, shot, np.ones(shape, bool)))
             channels = [("", self._names[c]) for c in np.unique(channel).tolist()]
             self._add("system gain", "DN/e-", channels, Pair(*gains), groups)
-        return {title: (level[0], noise[0]) for title, level, noise in zip(CAMERAS, mean, noise, strict=True)}
+        return {
+            f"{title} {self._names[c]}".strip(): (levels[0, channel == c], noises[0, channel == c])
+            for c in np.unique(channel).tolist()
+            for title, levels, noises in zip(CAMERAS, mean, noise, strict=True)
+        }
 
     def add_edges(self, pair: Pair, used: Bools) -> dict[str, tuple[Floats, Floats]]:
         """Add the MTF of each filter; return its curves."""
@@ -192,6 +196,8 @@ class DeviationTable:
             found += [[(_at(f, e, e.mtf), _at(f, e, e.mtf_sigma)) for e in edges] for f in at_per_mm.tolist()]
             titles = [("MTF50", "", name, "per mm"), *(("MTF", f"{f:.4g} per mm", name, "") for f in at_per_mm)]
             for title, ((real, error), (simulated, other)) in zip(titles, found, strict=True):
+                if math.isnan(real - simulated):  # no MTF50 below the highest frequency
+                    continue
                 self._rows.append(_Row(*title, real, simulated, math.hypot(error, other), math.inf))
         return curves
 

@@ -21,10 +21,12 @@ from foveasim._core.validation import Floats, Ints, as_any_array, as_numbers, fi
 from foveasim._io.formats import FormatError
 from foveasim._io.images import TIFF_EXTENSIONS, read_picture
 from foveasim._io.rasters.fits import open_fits, read_image, select_image
+from foveasim.camera import Camera
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout
 from foveasim.layout.rows import site_rows
 from foveasim.maps._npy import read_npy
+from foveasim.twin._target_scenes import undistorted
 
 __all__ = ["FirstRow", "Raster", "check_unsaturated"]
 
@@ -96,12 +98,6 @@ class Raster(NamedTuple):
                 hint,
             )
 
-    def per_site(self, picture: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of a picture for each site, (n_site,)."""
-        values = np.empty(self.sites.size, picture.dtype)
-        values[self.sites.ravel()] = picture.ravel()
-        return values
-
     def regions(self, regions: Sequence[Sequence[float]], first_row: FirstRow) -> Ints:
         """Return the number of the region of each site, (n_site,), -1 outside."""
         n_y, n_x = self.sites.shape
@@ -117,20 +113,30 @@ class Raster(NamedTuple):
             if np.any(labels[rows, x0:x1] >= 0):
                 raise ParameterError("regions", f"must not overlap, as region {k} does with an earlier one")
             labels[rows, x0:x1] = k
-        return self.per_site(labels)
+        found: Ints = np.empty(labels.size, np.int64)
+        found[self.sites.ravel()] = labels.ravel()
+        return found
 
     def chart(
-        self, corners: Sequence[Sequence[float]], shape: tuple[int, int], gap_fraction: float, first_row: FirstRow
+        self,
+        camera: Camera,
+        corners: Sequence[Sequence[float]],
+        shape: tuple[int, int],
+        gap_fraction: float,
+        first_row: FirstRow,
     ) -> tuple[Ints, Ints]:
         """
         Return the number of the patch of each site, (n_site,) twice.
 
         Patches of ``shape`` (n_row, n_column) with gaps, relative to their sides, fill the quadrangle of the corners in
-        perspective. First the inner part of each patch, which is measured, and -1 elsewhere; then the complete patch, and the
-        number of patches in black gaps and beyond the corners, or -1 without gaps.
+        perspective, without the distortion of the camera. First the inner part of each patch, which is measured, and -1
+        elsewhere; then the complete patch, and the number of patches in black gaps and beyond the corners, or -1 without gaps.
         """
         n_y, n_x = self.sites.shape
-        xy = _check_corners(corners, (n_x, n_y), first_row)
+        x0_um, y0_um, x1_um, y1_um = camera.layout.bounds_um
+        from_top = _check_corners(corners, (n_x, n_y), first_row) / (n_x, n_y)
+        at_um = np.array([x0_um, y1_um]) + from_top * (x1_um - x0_um, y0_um - y1_um)
+        xy, sites_um = undistorted(camera, at_um), undistorted(camera, camera.layout.centroid_um)
         step = 1.0 + gap_fraction
         width, height = shape[1] * step - gap_fraction, shape[0] * step - gap_fraction
         target = np.array([(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)])
@@ -139,8 +145,7 @@ class Raster(NamedTuple):
         left = np.block([[points, zeros], [zeros, points]])
         equations = np.column_stack((left, -target.T.reshape(8, 1) * np.tile(xy, (2, 1))))
         h = np.append(np.linalg.solve(equations, target.T.ravel()), 1.0).reshape(3, 3)
-        pixel_x, pixel_y = np.meshgrid(np.arange(n_x) + 0.5, np.arange(n_y) + 0.5)
-        mapped = np.tensordot(h, np.stack((pixel_x, pixel_y, np.ones_like(pixel_x))), axes=1)
+        mapped = h @ np.column_stack((sites_um, np.ones(len(sites_um)))).T
         is_visible = mapped[2] * (h[2, :2] @ xy[0] + 1.0) > 0.0  # not behind the horizon
         u, v = mapped[:2] / np.where(is_visible, mapped[2], np.nan)
         is_in = (u >= 0.0) & (u < width) & (v >= 0.0) & (v < height)
@@ -149,7 +154,7 @@ class Raster(NamedTuple):
         is_patch = is_in & (np.maximum(x, y) <= 1.0)
         is_inner = is_in & (np.maximum(np.abs(x - 0.5), np.abs(y - 0.5)) < 0.5 * MEASURED_FRACTION)
         outside = math.prod(shape) if gap_fraction else -1
-        return self.per_site(np.where(is_inner, patch, -1)), self.per_site(np.where(is_patch, patch, outside))
+        return np.where(is_inner, patch, -1), np.where(is_patch, patch, outside)
 
 
 def _check_corners(corners: Sequence[Sequence[float]], size_px: tuple[int, int], first_row: FirstRow) -> Floats:

@@ -22,7 +22,16 @@ from foveasim.scene import Scene, charts
 from foveasim.scene._illuminants import Illuminant
 from foveasim.scene._photometry import level_of_white
 
-__all__ = ["WAVES_NM", "WIDTHS_NM", "axis_um", "check_slanted", "edge_rates", "painted_rates", "white_of"]
+__all__ = [
+    "WAVES_NM",
+    "WIDTHS_NM",
+    "axis_um",
+    "check_slanted",
+    "edge_rates",
+    "painted_rates",
+    "undistorted",
+    "white_of",
+]
 
 #: Bands of the scenes, and the illuminance of their white at the light factor 1.
 WAVES_NM = np.arange(400.0, 701.0, 10.0)
@@ -53,7 +62,7 @@ def axis_um(camera: Camera) -> Floats:
     return 0.5 * (bounds_um[:2] + bounds_um[2:])
 
 
-def _undistorted(camera: Camera, xy_um: Floats) -> Floats:
+def undistorted(camera: Camera, xy_um: Floats) -> Floats:
     """Return points (n, 2) in the ideal image."""
     return xy_um if camera.distortion is None else camera.distortion.undistort(xy_um)
 
@@ -81,7 +90,7 @@ def painted_rates(
     # Otherwise, images of cells of the size of sites would be computed on many finer cells.
     camera = camera.replace(optics=replace(camera.optics, oversample=1))
     grid = camera.image_grid(scene_of(np.ones((1, *shape), np.float32), white[np.newaxis]))
-    xy = (_undistorted(camera, camera.layout.centroid_um) - grid.origin_um) / grid.pitch_xy_um
+    xy = (undistorted(camera, camera.layout.centroid_um) - grid.origin_um) / grid.pitch_xy_um
     column, row = np.clip(xy.astype(np.int64), 0, np.array(shape[::-1]) - 1).T
     cells = np.full(shape, -1)
     is_patch = patches >= 0
@@ -117,9 +126,9 @@ def edge_rates(camera: Camera, used: Bools, edge: EdgeMtf, white: Floats, distan
     centre_um = 0.5 * (low_um + high_um)
     at_um = centre_um + (edge.offset_um - centre_um @ normal) * normal
     along_um = margin_um * np.array([-normal[1], normal[0]])
-    start_um, at_um, end_um = _undistorted(camera, np.array([at_um - along_um, at_um, at_um + along_um]))
+    start_um, at_um, end_um = undistorted(camera, np.array([at_um - along_um, at_um, at_um + along_um]))
     angle_deg = float(np.rad2deg(np.arctan2(*(end_um - start_um)[::-1]))) - 90.0
-    half_um = np.abs(_undistorted(camera, xy_um[sites]) - at_um).max(axis=0) + margin_um
+    half_um = np.abs(undistorted(camera, xy_um[sites]) - at_um).max(axis=0) + margin_um
     n_pixels = min(EDGE_PIXELS, max(2, int(MAX_EDGE_PIXELS * pitch_um / (2.0 * half_um.max()))))
     magnification = camera.optics.magnification(distance_m)
     scene = charts.slanted_edge(

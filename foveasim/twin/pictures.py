@@ -68,7 +68,7 @@ class PictureComparison:
     notes : tuple of str
         How the quantities were measured.
     real_dn, simulated_dn : (n_y, n_x) float64, DN
-        Mean frames, top row first.
+        Mean frames, top row first; NaN where the scene of an edge was not simulated.
     curves : mapping of str to (x, y)
         Curves of the figure, ``"real"`` and ``"simulated"``, with the filter where there are several.
     axis_labels : (str, str)
@@ -310,19 +310,21 @@ def compare_with(
         table.add_colours(charges, measured, scene, illuminant)
         notes.append("Colours are balanced on their greys and corrected by the matrix of the simulated camera.")
     if target == "slanted_edge":
-        curves, axis_labels = table.add_edges(charges, used), ("frequency / (line pairs per mm)", "MTF")
+        curves = table.add_edges(charges, used)
+        axis_labels = "frequency / (line pairs per mm)", "MTF"
     elif target == "flat_field":
         table.add_signals(pair, np.where(measured == 0, 0, -1), ["centre"])
-        curves, axis_labels = (
-            table.add_rings(charges, measured),
-            ("ring from the optical axis", "relative illumination"),
-        )
+        curves = table.add_rings(charges, measured)
+        axis_labels = "ring from the optical axis", "relative illumination"
     else:
         names = [f"patch {k}" for k in range(len(steps))] if target == "grey_steps" else PATCH_NAMES
         greys = measured if target == "grey_steps" else np.where(measured >= FIRST_GREY, measured, -1)
         curves = table.add_signals(pair, greys, names, darks=darks)
         axis_labels = "mean code / DN", f"{NOISE[len(real) > 1]} / DN"
-    if len(real) == 1:
+    simulated_dn = simulated.mean(axis=0)
+    if target == "slanted_edge" and scene is None:
+        simulated_dn[rate_e_per_s == 0.0] = np.nan
+    if len(real) == 1 and target != "slanted_edge":
         notes.append("The noise is spatial, within patches of one frame, with their fixed pattern and shading.")
     return PictureComparison(
         target=target,
@@ -332,7 +334,7 @@ def compare_with(
         confidence=CONFIDENCE,
         notes=tuple(notes),
         real_dn=read_only(real.mean(axis=0)[raster.sites]),
-        simulated_dn=read_only(simulated.mean(axis=0)[raster.sites]),
+        simulated_dn=read_only(simulated_dn[raster.sites]),
         curves=curves,
         axis_labels=axis_labels,
     )
@@ -377,7 +379,7 @@ def _patches(
         painted: Ints = np.zeros_like(measured)
     elif corners is not None:
         shape = CHART_SHAPE if target == "colour_chart" else (1, n_steps)
-        measured, painted = raster.chart(corners, shape, gap_fraction, order)
+        measured, painted = raster.chart(camera, corners, shape, gap_fraction, order)
     else:
         assert regions is not None
         measured = painted = raster.regions(regions, order)

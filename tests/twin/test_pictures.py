@@ -275,6 +275,18 @@ def test_rotated_chart_is_measured_by_corners():
         assert one.real == pytest.approx(other.real, abs=1.5)
 
 
+def test_chart_is_found_through_distortion():
+    lens = fs.distortion.BrownConrady(focal_um=8000.0, k1=-60.0)  # a tenth of the image height at the corners
+    camera = fs.Camera(optics=BAYER.optics, sensor=BAYER.sensor, distortion=lens)
+    up_um = (CORNERS - (N_X / 2, N_Y / 2)) * (PITCH_UM, -PITCH_UM)
+    corners = lens.distort(up_um) / (PITCH_UM, -PITCH_UM) + (N_X / 2, N_Y / 2)
+    frames = frames_of(camera, replace(CHART, basis=np.pad(CHART.basis, ((0, 0), (60, 60), (80, 80)))), seed=18)
+    found = camera.compare_with(frames, "colour_chart", exposure_s=EXPOSURE_S, corners=corners, gap_fraction=0.1)
+
+    assert np.abs(corners - CORNERS).max() > 4.0
+    assert found.outside == ()
+
+
 # -- orientation and files -----------------------------------------------------------------------------------------
 
 
