@@ -28,10 +28,10 @@ from foveasim.scene.charts import PATCH_NAMES
 from foveasim.twin._target_scenes import WAVES_NM, WIDTHS_NM
 from foveasim.units import per_mm_from_per_um
 
-__all__ = ["CAMERAS", "NOISE", "Deviation", "DeviationTable", "Pair", "has_sites"]
+__all__ = ["CAMERAS", "SPATIAL", "Deviation", "DeviationTable", "Pair", "has_sites"]
 
-#: Titles of the curves, and of the noise by whether there are several frames.
-CAMERAS, NOISE = ("real", "simulated"), ("spatial noise", "temporal noise")
+#: Titles of the curves, and of the noise.
+CAMERAS, SPATIAL, TEMPORAL = ("real", "simulated"), "spatial noise", "temporal noise"
 #: Blocks of sites of the jackknife.
 N_BLOCKS = 100
 #: Frequencies of the MTF that are compared, in fractions of the Nyquist frequency of the pitch.
@@ -100,12 +100,20 @@ class _Row(NamedTuple):
 
 
 class DeviationTable:
-    """Compared quantities, whose intervals are simultaneous."""
+    """
+    Compared quantities, whose intervals are simultaneous.
 
-    def __init__(self, camera: Camera) -> None:
-        self._camera, self._rows = camera, list[_Row]()
+    ``has_temporal``: whether the noise of several frames is that between them.
+    """
+
+    def __init__(self, camera: Camera, *, has_temporal: bool = True) -> None:
+        self._camera, self._has_temporal, self._rows = camera, has_temporal, list[_Row]()
         self._filters = camera.sensor.filter_of_site
         self._names = ["" if has_sites(camera).sum() == 1 else name for name in camera.sensor.filter_names]
+
+    def noise_of(self, frames: Pair) -> str:
+        """Return the title of the noise of frames."""
+        return TEMPORAL if self._has_temporal and len(frames.real) > 1 else SPATIAL
 
     def deviations(self) -> tuple[Deviation, ...]:
         """Return all rows with their intervals."""
@@ -148,10 +156,13 @@ class DeviationTable:
     ) -> dict[str, tuple[Floats, Floats]]:
         """Add level and noise of patches, and the system gain; return noise against level."""
         used, groups, patch, channel = self._classes(labels)
-        is_temporal = len(pair.real) > 1
-        title, noise_title = titles or ("mean code", NOISE[is_temporal])
+        is_temporal = self.noise_of(pair) == TEMPORAL
+        title, noise_title = titles or ("mean code", self.noise_of(pair))
         mean, variance = (
-            Pair(*parts) for parts in zip(*(_moments(codes[:, used], groups) for codes in pair), strict=True)
+            Pair(*parts)
+            for parts in zip(
+                *(_moments(codes[:, used], groups, is_temporal=is_temporal) for codes in pair), strict=True
+            )
         )
         parts = [(names[p], self._names[c]) for p, c in zip(patch.tolist(), channel.tolist(), strict=True)]
         noise = Pair(*(np.sqrt(np.maximum(values, 0.0)) for values in variance))
@@ -162,7 +173,7 @@ class DeviationTable:
             dark_used, dark_groups, *_ = self._classes(np.zeros_like(labels))
             zero = None
             if darks is not None and len(darks.real) > 1:
-                zero = [_moments(codes[:, dark_used], dark_groups) for codes in darks]
+                zero = [_moments(codes[:, dark_used], dark_groups, is_temporal=is_temporal) for codes in darks]
             gains = []
             for k, moments in enumerate(zip(mean, variance, strict=True)):
                 level, noise2 = (values.reshape(-1, *shape) for values in moments)
@@ -238,9 +249,9 @@ class DeviationTable:
         self._add("mean colour error (CIE 2000)", "", [("", "")], means, groups)
 
 
-def _moments(codes: NDArray[Any], groups: SiteClasses) -> tuple[Floats, Floats]:
+def _moments(codes: NDArray[Any], groups: SiteClasses, *, is_temporal: bool) -> tuple[Floats, Floats]:
     """Return mean and noise variance of subsets, (1 + n_block, n_class)."""
-    if len(codes) > 1:
+    if is_temporal:
         classes = groups.labels[groups.class_index]
         mean, temporal, _ = measure_subsets([codes], classes=classes, n_blocks=N_BLOCKS)[1]
         return mean[:, 0], temporal[:, 0]

@@ -29,7 +29,7 @@ from foveasim.scene._illuminants import Illuminant
 from foveasim.scene._scene import DISTANCE
 from foveasim.scene.charts import PATCH_NAMES, patch_reflectance
 from foveasim.sensor.limits import EXPOSURE
-from foveasim.twin._deviations import NOISE, Deviation, DeviationTable, Pair, has_sites
+from foveasim.twin._deviations import SPATIAL, Deviation, DeviationTable, Pair, has_sites
 from foveasim.twin._frames import FirstRow, Raster, check_unsaturated
 from foveasim.twin._target_scenes import WAVES_NM, axis_um, check_slanted, edge_rates, painted_rates, white_of
 
@@ -162,6 +162,7 @@ def compare_with(
     gap_fraction: Annotated[float, FRACTION] = 0.0,
     reflectance: ArrayLike | None = None,
     dark: OwnCheck[Any] = None,
+    noise: Literal["temporal", "spatial"] | None = None,
     first_row: FirstRow | None = None,
     scene: Scene | None = None,
     light_factor: Annotated[float | None, POSITIVE] = None,
@@ -177,8 +178,8 @@ def compare_with(
     camera : Camera
         With a regular sensor: photosites in complete rows and columns.
     frames : (n_frame, n_y, n_x) or (n_y, n_x) numbers, path, or list of either
-        Codes of the photosites, of mosaics without demosaicing: arrays, or TIFF, PNG, npy or FITS files. Several frames give
-        the temporal noise; one frame the spatial noise within patches.
+        Codes of the photosites, of mosaics without demosaicing: arrays, or TIFF, PNG, npy or FITS files. Several frames of
+        an unchanged scene are necessary for the temporal noise.
     target : {"slanted_edge", "grey_steps", "colour_chart", "flat_field"}
     exposure_s : float, s
         Exposure time of the frames.
@@ -196,6 +197,9 @@ def compare_with(
     dark : as ``frames``, optional
         Dark frames of the same exposure, for the black level and the dark noise. Without them, the black level of the simulated
         sensor is subtracted from real codes, too.
+    noise : {"temporal", "spatial"}, optional
+        Noise of patches: between frames, or between the sites of the first frame, with fixed patterns and shading. By default
+        temporal for several frames, and spatial for one.
     first_row : {"top", "bottom"}, optional
         Which row of the upright picture is the first one in the arrays. By default the top row, and the bottom row in FITS
         files without ``ROWORDER = 'TOP-DOWN'``.
@@ -259,6 +263,11 @@ def compare_with(
     raster = Raster.of(camera.layout, sensor.bits)
     real, order = raster.codes("frames", frames, first_row)
     unlit = None if dark is None else raster.codes("dark", dark, first_row)[0]
+    for name, codes in (("frames", real), ("dark", real if unlit is None else unlit)):
+        if noise == "temporal" and len(codes) < 2:
+            raise ParameterError(
+                name, "must be several frames for the temporal noise, got one", hint="or use noise='spatial'"
+            )
     steps = _steps(target, reflectance)
     measured, painted = _patches(camera, target, raster, order, regions, corners, gap_fraction, len(steps))
     check_unsaturated(real, measured, sensor.bits)
@@ -300,12 +309,12 @@ def compare_with(
     simulated = draw(sensor.expected_electrons(light_factor * rate_e_per_s, exposure_s), n_frames=len(real))
     pair, charges = Pair(real, simulated), Pair(real_e, light_e(simulated))
 
-    table = DeviationTable(camera)
+    table = DeviationTable(camera, has_temporal=noise != "spatial")
     if darks is None:
         notes.append("The black level is that of the simulated sensor.")
     else:
         every = np.zeros(n_sites, np.int64)
-        table.add_signals(darks, every, [""], ("black level", f"{NOISE[len(darks.real) > 1]} in the dark"))
+        table.add_signals(darks, every, [""], ("black level", f"{table.noise_of(darks)} in the dark"))
     if target == "colour_chart":
         table.add_colours(charges, measured, scene, illuminant)
         notes.append("Colours are balanced on their greys and corrected by the matrix of the simulated camera.")
@@ -320,11 +329,11 @@ def compare_with(
         names = [f"patch {k}" for k in range(len(steps))] if target == "grey_steps" else PATCH_NAMES
         greys = measured if target == "grey_steps" else np.where(measured >= FIRST_GREY, measured, -1)
         curves = table.add_signals(pair, greys, names, darks=darks)
-        axis_labels = "mean code / DN", f"{NOISE[len(real) > 1]} / DN"
+        axis_labels = "mean code / DN", f"{table.noise_of(pair)} / DN"
     simulated_dn = simulated.mean(axis=0)
     if target == "slanted_edge" and scene is None:
         simulated_dn[rate_e_per_s == 0.0] = np.nan
-    if len(real) == 1 and target != "slanted_edge":
+    if table.noise_of(pair) == SPATIAL and target != "slanted_edge":
         notes.append("The noise is spatial, within patches of one frame, with their fixed pattern and shading.")
     return PictureComparison(
         target=target,

@@ -226,6 +226,12 @@ def test_vignetting_of_numpy_frames_is_found():
     assert [row.simulated for row in rows] == pytest.approx([1.0] * 4, abs=1e-3)
 
 
+def test_rotated_frames_have_other_levels():
+    found = compare_greys(frames_of(MONO, GREYS, seed=20)[:, ::-1, ::-1])
+
+    assert not any(row.is_within for row in rows_of(found, "mean code"))
+
+
 # -- colours -------------------------------------------------------------------------------------------------------
 
 CHART = fs.scene.charts.colour_chart(
@@ -424,6 +430,18 @@ def test_missing_and_straight_edges_are_rejected(angle_deg, message):
 
     with pytest.raises(SimulationError, match=message):
         MONO.compare_with(frames, "slanted_edge", exposure_s=EXPOSURE_S, regions=EDGE_REGION)
+
+
+def test_one_frame_has_no_temporal_noise():
+    frames = numpy_frames(steps_e(), seed=19, n=2)
+
+    with pytest.raises(ParameterError, match="'frames' must be several frames for the temporal noise, got one"):
+        compare_greys(frames[0], camera=UNIFORM, noise="temporal")
+    with pytest.raises(ParameterError, match="'dark' must be several frames"):
+        compare_greys(frames, camera=UNIFORM, noise="temporal", dark=frames[0])
+    one, other = (compare_greys(each, camera=UNIFORM, noise="spatial") for each in (frames[0], frames))
+    assert not rows_of(other, "temporal noise")
+    assert [row.real for row in rows_of(one, "spatial noise")] == [row.real for row in rows_of(other, "spatial noise")]
 
 
 def test_lossy_and_colour_files_are_rejected(tmp_path):
