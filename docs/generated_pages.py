@@ -71,6 +71,7 @@ MODULES = {
     "foveasim.modes": "Rolling shutters, event pixels, integrate-and-fire pixels.",
     "foveasim.metrics": "Resolution, aliasing, photon transfer, signal-to-noise ratio, picture quality, optical flow.",
     "foveasim.compare": "Cameras and layouts at equal budget: pictures, quality by eccentricity, information, reports.",
+    "foveasim.twin": "Real cameras: their frames beside simulated ones.",
     "foveasim.view": "Plots, 3D rendering, solids, and interactive pages.",
     "foveasim.explore": "Sweeps, optimisation studies and datasets.",
     "foveasim.config": "Settings files in YAML.",

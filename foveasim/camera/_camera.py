@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any, Literal, overload
+from typing import TYPE_CHECKING, Annotated, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from foveasim._core.calls import NOT_NEGATIVE, Limits, OwnCheck
 from foveasim._core.provenance import copy_plain_data, to_plain_data
 from foveasim._core.random_streams import Streams
-from foveasim._core.show import view_method
+from foveasim._core.show import load, view_method
 from foveasim._core.threads import cached_property, thread_count
 from foveasim._core.validation import Floats, check_per_site, check_point, finite_array
 from foveasim.camera._clock import Clock
@@ -46,6 +46,9 @@ from foveasim.sensor import Footprints, NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET, PERCENTILE, TARGET
 from foveasim.units import um_from_nm, w_from_w_m2_um2
+
+if TYPE_CHECKING:
+    from foveasim.twin import PictureComparison
 
 #: What the optical axis is fixed to when the gaze moves: see :class:`Camera`.
 GazeAxis = Literal["image", "sensor"]
@@ -868,6 +871,18 @@ class Camera:
         """
         rate_e_per_s = self.photoelectrons_per_s(light)
         return noise_budget(self._sensor, rate_e_per_s, seconds_of(self, exposure_s, rate_e_per_s))
+
+    def compare_with(
+        self,
+        frames: OwnCheck[Any],
+        target: Literal["slanted_edge", "grey_steps", "colour_chart", "flat_field"],
+        *,
+        exposure_s: float,
+        **options: Any,
+    ) -> PictureComparison:
+        """Compare real frames with simulated ones; see :func:`foveasim.twin.compare_with`."""
+        compare_with = load("twin").compare_with
+        return compare_with(self, frames, target, exposure_s=exposure_s, **options)
 
     def incidence(self, light: Scene | PowerMap) -> Incidence:
         """

@@ -1,5 +1,5 @@
 """
-Real cameras and their simulation: from recorded frames to a sensor.
+Real cameras and their simulation: from recorded frames or events to a sensor, and real pictures beside simulated ones.
 
 ::
 
@@ -11,10 +11,27 @@ from __future__ import annotations
 
 from foveasim._core.calls import publish
 from foveasim.twin.camera_fit import fit
+from foveasim.twin.event_pixels import EventPixelFit, fit_event_pixels
+from foveasim.twin.event_recordings import StaticRecording, StepResponses
 from foveasim.twin.intervals import Estimate
+from foveasim.twin.pictures import Deviation, PictureComparison, compare_with
 from foveasim.twin.result import Twin, read_twin
 from foveasim.twin.stacks import Stack, read_stacks
 
-__all__ = ["Estimate", "Stack", "Twin", "fit", "read_stacks", "read_twin"]
+__all__ = [
+    "Deviation",
+    "Estimate",
+    "EventPixelFit",
+    "PictureComparison",
+    "Stack",
+    "StaticRecording",
+    "StepResponses",
+    "Twin",
+    "compare_with",
+    "fit",
+    "fit_event_pixels",
+    "read_stacks",
+    "read_twin",
+]
 
 publish(__name__)

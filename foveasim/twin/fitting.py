@@ -66,7 +66,8 @@ class Fitted:
     Result of :func:`fit_statistics`.
 
     ``estimates``: parameters with intervals, or why they are not identifiable. ``maps``: (n_y, n_x) by name. ``levels``,
-    ``fit``: statistics and chain. ``assumptions``: what was taken as known. ``classes`` (n_y, n_x): class of each pixel, -1 for defects.
+    ``fit``: statistics and chain. ``assumptions``: what was taken as known. ``classes`` (n_y, n_x): class of each pixel, -1 for
+    defects.
     """
 
     estimates: dict[str, Estimate | Uncertain]

@@ -2,8 +2,8 @@
 Fit of the chain to means and variances of levels, by maximum likelihood.
 
 Means and variances over many pixels and frames are Gaussian, and independent of each other for Gaussian noise: the likelihood
-is that of weighted squares, with the moments of the chain (:meth:`foveasim.Sensor.predict`), and weights by the variances that it
-predicts. Weights follow the parameters (iteratively reweighted), so that the equations of the estimate are unbiased.
+is that of weighted squares, with the moments of the chain (:meth:`foveasim.Sensor.predict`), and weights by the variances that
+it predicts. Weights follow the parameters (iteratively reweighted), so that the equations of the estimate are unbiased.
 
 Uncertainties come from the differences between blocks of rows, through the linear map from the statistics to the estimate (the
 "sandwich"): they include what differs between pixels, and correlations, of any distribution.

@@ -119,8 +119,8 @@ class Twin:
         ----------
         layout : Layout, optional
             Other photosites. By default those of the camera, with the maps of its pixels; noise of the maps is reduced by
-            taking each value in proportion to its reliability. Other layouts have patterns of the same statistics: full well, dark
-            current and steps of the ADC in electrons are proportional to the area of a site, read noise is that of the pixel.
+            taking each value in proportion to its reliability. Other layouts have patterns of the same statistics: full well,
+            dark current and steps of the ADC in electrons are proportional to the area of a site, read noise is that of the pixel.
         **parameters
             Parameters of :class:`foveasim.Sensor`, such as ``filters`` and ``qe``, or values instead of estimated ones.
 

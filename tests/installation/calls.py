@@ -264,6 +264,11 @@ class Objects:
         )
 
     @cached_property
+    def twins(self):
+        camera = fs.Camera(optics=self.optics, sensor=fs.Sensor(fs.layout.grid(n_x=30, n_y=30, pitch_um=3.0)))
+        return camera.compare_with(np.full((2, 30, 30), 9), "flat_field", exposure_s=0.01)
+
+    @cached_property
     def covariance(self):
         return fs.compare.SceneCovariance(np.ones(2), np.array([2.0, 5.0]))
 
@@ -372,6 +377,7 @@ CALLS = {
     ),
     "Camera.video": lambda o: list(o.camera.video([o.scene] * 2, exposure_s=0.01, seed=0)),
     "Camera.noise_budget": lambda o: o.camera.noise_budget(o.scene, exposure_s=0.01).plot(),
+    "Camera.compare_with": lambda o: o.twins,
     "Camera.predict": lambda o: o.camera.predict(o.scene, exposure_s=0.01),
     "compare.budget_of": lambda o: compare.budget_of(o.camera, 30.0),
     "compare.cameras": lambda o: o.comparison.summary("psnr_db"),
@@ -666,6 +672,8 @@ CALLS = {
     "tiles.capture_tiles": lambda o: list(tiles.capture_tiles(o.simple, o.scene, exposure_s=0.01, seed=0)),
     "tiles.read_tiles": lambda o: tiles.read_tiles(o.tiled.path).picture(),
     "tiles.write_tiles": lambda o: tiles.write_tiles(o.path(".zarr"), o.simple, o.scene, exposure_s=0.01, seed=0),
+    "twin.compare_with": lambda o: o.twins.plot(),
+    "twin.PictureComparison.to_pandas": lambda o: o.twins.to_pandas(),
     "units.decode_srgb": lambda o: units.decode_srgb(0.5),
     "units.electrons_to_volts": lambda o: units.electrons_to_volts(LENGTH, 1e-15),
     "units.encode_srgb": lambda o: units.encode_srgb(0.5),

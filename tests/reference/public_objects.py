@@ -93,6 +93,7 @@ def public_objects(directory):
         repeats=1, seed=0, metrics={}, files={},
     )  # fmt: skip
     solids = view.solids(fs.layout.grid(2, 2, 5.0), view.SensorStack())
+    twins = fs.Camera(optics=OPTICS, sensor=SENSOR).compare_with(np.full((2, 30, 40), 9), "flat_field", exposure_s=0.01)
     return [
         CAMERA, capture, fs.DesignRules(preset="sky130_met1"), fs.rgb_filters() * CURVE, fs.Grid((2, 3), 0.5), SITES, OPTICS,
         fs.GaussianCurve(centre_nm=550.0, fwhm_nm=90.0), CAMERA.integrator(GRID), capture.picture(), CAMERA.power_map(SCENE),
@@ -151,6 +152,7 @@ def public_objects(directory):
         config.Source(file=Path("sweep.yaml"), keys=("shot",), index="3"), layout.SolveFor(name="n_x", is_integer=True, is_increasing=True, guess=len),
         compare.budget_of(CAMERA, 30.0), fs.metrics.metric_info("psnr_db"), compare.median_interval(np.ones((50, 5))), compare.SceneCovariance(np.ones(50), np.ones(50)),
         compare.quality_by_eccentricity(capture.picture(), capture.picture(), edges_um=np.array([0.0, 20.0])),
+        twins, twins.deviations[0],
         compare.cameras({"a": CAMERA, "b": CAMERA}, {"flat": SCENE}, exposure_s=0.01, n_annuli=2),
         reconstruct.ColourCorrection(np.eye(3), np.zeros(24), np.zeros(24)),
         reconstruct.CorticalImage(data=np.ones((1, 20, 30)), radius_um=np.arange(21.0), start_rad=np.zeros(20)),
