@@ -43,7 +43,7 @@ FLOORS = {
     ],
     "design": [{"layout"}],
     "show": [{"view"}],
-    "lab": [{"tiles", "video"}, {"metrics"}, {"compare"}, {"config"}, {"explore", "learn"}],
+    "lab": [{"tiles", "video"}, {"metrics"}, {"compare"}, {"config"}, {"explore", "learn", "twin"}],
     "studio": [{"studio", "testing"}, {"cli"}, {"__main__"}],
 }  # fmt: skip
 LAYERS = [layer for layers in FLOORS.values() for layer in layers]
@@ -55,7 +55,7 @@ HEAVY = {
 }  # fmt: skip
 #: Names of dimensionless numbers, or of numbers in the unit of other arguments.
 DIMENSIONLESS = {
-    "combinations", "displaced", "relative_illumination", "field_tolerance", "goal", "singular_values", "a", "above", "alpha", "amplitude", "area_ratio", "at_least", "at_most", "beta", "blanking", "circle_tolerance", "coefficients", "colour_matrix", "companding_table", "contrast", "contrast_off", "contrast_on", "count", "custom", "data_range", "delta_e", "delta_e_raw", "deviation", "dilation", "dpi", "esf", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "half_step", "high", "hot_sigmas", "illuminant", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
+    "combinations", "displaced", "relative_illumination", "field_tolerance", "goal", "singular_values", "a", "above", "alpha", "amplitude", "area_ratio", "at_least", "at_most", "beta", "blanking", "circle_tolerance", "coefficients", "colour_matrix", "companding_table", "contrast", "contrast_noise", "contrast_off", "contrast_on", "log_contrast", "threshold", "thresholds_off", "thresholds_on", "intervals", "count", "custom", "data_range", "delta_e", "delta_e_raw", "deviation", "dilation", "dpi", "esf", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "half_step", "high", "hot_sigmas", "illuminant", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
     "limit", "limits", "log_strength", "low", "magnification", "matrix", "median", "min_coverage", "misfit", "missing", "mtf", "mtf_sigma", "mu", "max_aspect_ratio", "obscuration", "offset",
     "max_density", "max_growth", "max_neighbour_ratio", "max_track_utilisation", "min_density", "min_growth", "neighbour_fraction", "noisy_ratio", "out", "p1", "p2", "peak", "per_vertex", "percentile", "power", "dynamic_range_db", "prnu_percent", "psnr_db", "psnr_db_by_eccentricity", "qe_percent", "snr_max_db", "value_db", "qe", "ratio", "reflectance", "refractive_index", "response", "rounding", "s1", "s2", "s3", "s4", "xi",
     "result", "result_at", "results", "ring_ratio", "sensitivity", "site_weights", "snr", "spectrum", "ssim", "ssim_by_eccentricity", "stretch", "target", "tolerance", "transmission", "value", "values", "variance", "wavelength", "weight", "weights", "white", "worst_area_error", "zoom",
@@ -65,8 +65,7 @@ INTERNAL = {
     "nodes", "slopes", "variance_slope", "along_y", "at_points", "fields", "profiles", "at", "axes", "before", "blur_cells", "blur_lambda_n", "bound", "bounds", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "homography", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
     "n_across", "n_source_cells", "moments", "new_radius", "node", "norm", "off_diagonal", "one", "other", "per_step", "pixel", "plane", "points", "quantiles", "r2", "radius", "right", "row", "rows", "s_x", "s_y", "scale", "screen", "side", "sigma", "slope", "spread", "start", "tables_at",
     "tangent2_x", "tangent2_y", "threshold", "to_step", "u", "upper", "v", "x", "x2", "xy", "y", "y2", "sampling", "step", "t", "weigh", "window",
-    "neutral", "primaries", "transfer",
-    "bounds_db", "difference_db", "illumination", "spectra", "srgb", "white_xyz", "xyz", "centre", "centres", "circles", "column_x", "compute", "discs", "maps", "opening", "photodiode", "position", "half", "lines_x", "lines_y", "ordered", "phase", "radians", "radians_x", "rho", "row_y", "segments", "shift", "tangents",
+    "neutral", "primaries", "transfer", "background", "changes", "bounds_db", "difference_db", "illumination", "spectra", "srgb", "white_xyz", "xyz", "centre", "centres", "circles", "column_x", "compute", "discs", "maps", "opening", "photodiode", "position", "half", "lines_x", "lines_y", "ordered", "phase", "radians", "radians_x", "rho", "row_y", "segments", "shift", "tangents",
 }  # fmt: skip
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")
 
