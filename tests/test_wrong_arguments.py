@@ -86,7 +86,7 @@ def outcome(call, values):
 #: Results: their numbers come from a simulation, and contain NaN and infinity where there is no value.
 RESULTS = {
     "AliasingSpectrum", "BarElement", "Budget", "Calibration", "Change", "Changes", "Comparison", "Cube", "EccentricityTable",
-    "EdgeMtf", "EmvaIntervals", "FieldModes", "FlowBound", "Found", "Mesh", "Outlines", "PartReport", "Plan", "PointSpread",
+    "EdgeMtf", "EmvaIntervals", "EventPixelFit", "FieldModes", "FlowBound", "Found", "Mesh", "Outlines", "PartReport", "Plan", "PointSpread",
     "Ramp", "Rates", "Recording", "Report", "RuleResult", "SamplingSpectrum", "Shot", "SiteColours", "SiteEstimates",
     "SiteGraph", "SitePixels", "SiteSignals", "Sites", "SnrTable", "Solution", "Stock", "Summary", "TiledCapture", "Violation",
     "WrittenLayout",
