@@ -67,6 +67,7 @@ MODULES = {
     "foveasim.reconstruct": "Raster pictures from captures.",
     "foveasim.columns": "Columns of photosites: what tables, figures, pages and exports show of a capture.",
     "foveasim.tiles": "Captures of sensors that are larger than memory.",
+    "foveasim.twin": "Parameters of real cameras from their recordings.",
     "foveasim.video": "Frames from files, gaze paths, recordings.",
     "foveasim.modes": "Rolling shutters, event pixels, integrate-and-fire pixels.",
     "foveasim.metrics": "Resolution, aliasing, photon transfer, signal-to-noise ratio, picture quality, optical flow.",
