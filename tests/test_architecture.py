@@ -57,6 +57,7 @@ HEAVY = {
 DIMENSIONLESS = {
     "combinations", "displaced", "relative_illumination", "field_tolerance", "goal", "singular_values", "a", "above", "alpha", "amplitude", "area_ratio", "at_least", "at_most", "beta", "blanking", "circle_tolerance", "coefficients", "colour_matrix", "companding_table", "contrast", "contrast_off", "contrast_on", "count", "custom", "data_range", "delta_e", "delta_e_raw", "deviation", "dilation", "dpi", "esf", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "half_step", "high", "hot_sigmas", "illuminant", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
     "confidence", "curves", "difference", "light_factor", "real", "regions", "simulated", "limit", "limits", "log_strength", "low", "magnification", "matrix", "median", "min_coverage", "misfit", "missing", "mtf", "mtf_sigma", "mu", "max_aspect_ratio", "obscuration", "offset",
+    "contrast_noise", "log_contrast", "threshold", "thresholds_off", "thresholds_on", "intervals",
     "max_density", "max_growth", "max_neighbour_ratio", "max_track_utilisation", "min_density", "min_growth", "neighbour_fraction", "noisy_ratio", "out", "p1", "p2", "peak", "per_vertex", "percentile", "power", "dynamic_range_db", "prnu_percent", "psnr_db", "psnr_db_by_eccentricity", "qe_percent", "snr_max_db", "value_db", "qe", "ratio", "reflectance", "refractive_index", "response", "rounding", "s1", "s2", "s3", "s4", "xi",
     "result", "result_at", "results", "ring_ratio", "sensitivity", "site_weights", "snr", "spectrum", "ssim", "ssim_by_eccentricity", "stretch", "target", "tolerance", "transmission", "value", "values", "variance", "wavelength", "weight", "weights", "white", "worst_area_error", "zoom",
 }  # fmt: skip
@@ -67,6 +68,7 @@ INTERNAL = {
     "tangent2_x", "tangent2_y", "threshold", "to_step", "u", "upper", "v", "x", "x2", "xy", "y", "y2", "sampling", "step", "t", "weigh", "window",
     "error", "freedom", "neutral", "primaries", "transfer",
     "bounds_db", "difference_db", "illumination", "spectra", "srgb", "white_xyz", "xyz", "centre", "centres", "circles", "column_x", "compute", "discs", "maps", "opening", "photodiode", "position", "half", "lines_x", "lines_y", "ordered", "phase", "radians", "radians_x", "rho", "row_y", "segments", "shift", "tangents",
+    "background", "changes",
 }  # fmt: skip
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")
 

@@ -88,6 +88,7 @@ RESULTS = {
     "AliasingSpectrum", "BarElement", "Budget", "Calibration", "Change", "Changes", "Comparison", "Cube", "Deviation",
     "EccentricityTable", "EdgeMtf", "EmvaIntervals", "FieldModes", "FlowBound", "Found", "Mesh", "Outlines", "PartReport", "PictureComparison", "Plan",
     "PointSpread", "Ramp", "Rates", "Recording", "Report", "RuleResult", "SamplingSpectrum", "Shot", "SiteColours", "SiteEstimates",
+    "EventPixelFit",
     "SiteGraph", "SitePixels", "SiteSignals", "Sites", "SnrTable", "Solution", "Stock", "Summary", "TiledCapture", "Violation",
     "WrittenLayout",
 }  # fmt: skip

@@ -16,7 +16,17 @@ from foveasim._core.calls import publish
 from foveasim.modes.events import Events, write_events
 from foveasim.modes.pixels import EventPixels, SpikingPixels
 from foveasim.modes.shutter import Between, Exposure, Shutter
+from foveasim.modes.step_response import event_probability
 
-__all__ = ["Between", "EventPixels", "Events", "Exposure", "Shutter", "SpikingPixels", "write_events"]
+__all__ = [
+    "Between",
+    "EventPixels",
+    "Events",
+    "Exposure",
+    "Shutter",
+    "SpikingPixels",
+    "event_probability",
+    "write_events",
+]
 
 publish(__name__)

@@ -25,8 +25,8 @@ from foveasim._core.jit import njit
 from foveasim._core.jit.types import FLOATS, FLOATS_2D
 
 #: State of a change-detecting site: low-pass level, its difference from the level of the last event, end of the refractory
-#: time, and integrated noise rate until the next noise event.
-LEVEL, DIFFERENCE, REFRACTORY_END, HAZARD = range(4)
+#: time, integrated noise rate until the next noise event, contrast noise, and the time of its next change.
+LEVEL, DIFFERENCE, REFRACTORY_END, HAZARD, CONTRAST_NOISE, CHANGE_AT = range(6)
 #: State of an integrating site: charge until the next spike; and REFRACTORY_END, as above.
 MISSING = 0
 #: With a low pass, frames are divided into parts in which the log current changes by at most this: one time constant each.
@@ -42,6 +42,13 @@ _bytes, _sites, _counts = types.int8[::1], types.int32[::1], types.int64[::1]
 @njit()
 def _random_words(key_0, key_1, site, number):
     return philox_4x64(key_0, key_1, np.uint64(site), np.uint64(number), np.uint64(0), np.uint64(0))
+
+
+@njit()
+def _contrast_noise(sigma, changes_per_s, after_s, word_0, word_1, word_2):
+    """Return a Gaussian number of standard deviation ``sigma``, and the time of the next one."""
+    noise = sigma * math.sqrt(-2.0 * math.log(uniform(word_0))) * math.cos(2.0 * math.pi * uniform(word_1))
+    return noise, after_s - math.log(uniform(word_2)) / changes_per_s if changes_per_s > 0.0 else math.inf
 
 
 @njit()
@@ -104,20 +111,21 @@ def _crossing(slope, swing, tau, begin, difference, on, off, end):
 @njit(
     types.int64(
         FLOATS_2D, FLOATS_2D, FLOATS, FLOATS, FLOATS, FLOATS, FLOATS, types.float64, types.float64,
-        types.float64, types.float64, types.uint64, types.uint64, types.int64, types.int64,
+        types.float64, types.float64, types.float64, types.float64, types.uint64, types.uint64, types.int64, types.int64,
         types.float64[:, ::1], _counts, _counts, types.float64[::1], _sites, _bytes,
     ),
 )  # fmt: skip
 def change_events(
     log_current, current, begins_s, steps_s, on, off, leak_per_s, refractory_s, tau_e, noise_per_s, noise_half,
-    key_0, key_1, first_site, max_events, memory, n_drawn, ends, t_s, site, polarity,
+    sigma, changes_per_s, key_0, key_1, first_site, max_events, memory, n_drawn, ends, t_s, site, polarity,
 ):  # fmt: skip
     """
     Compute the change events of some sites between the first and the last of some frames.
 
     ``log_current`` and ``current`` are (n_frame, n_site); frame k is at ``begins_s[k]``, and the next one ``steps_s[k]`` later.
     The log current is interpolated linearly between frames. ``tau_e`` divided by the current is the time constant of the low
-    pass; 0 disables it. Returns the number of events, including those that did not fit the arrays.
+    pass; 0 disables it. ``sigma`` is the standard deviation of the contrast noise, which is drawn again at each event and
+    ``changes_per_s`` times per second. Returns the number of events, including those that did not fit the arrays.
     """
     n = 0
     for k in range(log_current.shape[0] - 1):
@@ -130,8 +138,20 @@ def change_events(
                 n_drawn[i] = 1
                 word_0, word_1, _, _ = _random_words(key_0, key_1, first_site + i, 0)
                 memory[i, HAZARD] = -math.log(uniform(word_0))
-                # The initial phase of the leak is uniformly distributed between two events.
-                memory[i, DIFFERENCE] = uniform(word_1) * up if leak > 0.0 else 0.0
+                if leak > 0.0:
+                    # The initial phase of the leak is uniformly distributed between two events; early ones are more frequent
+                    # with noise, which restarts it.
+                    phase = uniform(word_1)
+                    n_noise = noise_per_s / (1.0 + current[k, i] / noise_half) * up / leak
+                    if n_noise > 0.0:
+                        phase = -math.log1p(phase * math.expm1(-n_noise)) / n_noise
+                    memory[i, DIFFERENCE] = phase * up
+                if sigma > 0.0:
+                    words = _random_words(key_0, key_1, first_site + i, 1)
+                    memory[i, CONTRAST_NOISE], memory[i, CHANGE_AT] = _contrast_noise(
+                        sigma, changes_per_s, begin_s, words[0], words[1], words[2]
+                    )
+                    n_drawn[i] = 2
             change = log_current[k + 1, i] - log_current[k, i]
             slope = change / frame_s
             total = slope + leak
@@ -153,8 +173,23 @@ def change_events(
                 noise = noise_per_s / (1.0 + mean / noise_half)
                 u = min(max(memory[i, REFRACTORY_END] - begin_s - part_begin_s, 0.0), part_s)
                 while u < part_s:
-                    at, sign = _crossing(total, swing, tau, u, memory[i, DIFFERENCE], up, down, part_s)
+                    offset, change_at = 0.0, math.inf
+                    if sigma > 0.0:
+                        offset = memory[i, CONTRAST_NOISE]
+                        change_at = max(memory[i, CHANGE_AT] - begin_s - part_begin_s, u)
+                    end = min(change_at, part_s)
+                    at, sign = _crossing(total, swing, tau, u, memory[i, DIFFERENCE], up - offset, down + offset, end)
                     noise_at = u + memory[i, HAZARD] / noise if noise > 0.0 else math.inf
+                    if change_at <= part_s and at > change_at and noise_at > change_at:
+                        memory[i, DIFFERENCE] += _rise(total, swing, tau, u, change_at)
+                        memory[i, HAZARD] -= noise * (change_at - u)
+                        words = _random_words(key_0, key_1, first_site + i, n_drawn[i])
+                        n_drawn[i] += 1
+                        memory[i, CONTRAST_NOISE], memory[i, CHANGE_AT] = _contrast_noise(
+                            sigma, changes_per_s, begin_s + part_begin_s + change_at, words[0], words[1], words[2]
+                        )
+                        u = change_at
+                        continue
                     if at > part_s and noise_at > part_s:
                         memory[i, DIFFERENCE] += _rise(total, swing, tau, u, part_s)
                         memory[i, HAZARD] -= noise * (part_s - u)
@@ -174,6 +209,12 @@ def change_events(
                         return n
                     memory[i, DIFFERENCE] = 0.0
                     memory[i, REFRACTORY_END] = at_s + refractory_s
+                    if sigma > 0.0:
+                        words = _random_words(key_0, key_1, first_site + i, n_drawn[i])
+                        n_drawn[i] += 1
+                        memory[i, CONTRAST_NOISE], memory[i, CHANGE_AT] = _contrast_noise(
+                            sigma, changes_per_s, at_s + refractory_s, words[0], words[1], words[2]
+                        )
                     u = at + refractory_s
                 if tau > 0.0:
                     memory[i, LEVEL] = log_level + part_change - slope * tau + swing * math.exp(-part_s / tau)

@@ -37,6 +37,8 @@ __all__ = ["EventPixels", "SpikingPixels"]
 MIN_THRESHOLD_FRACTION = 0.1
 #: Thresholds below 1e-3 are below the noise of any circuit, and would emit too many events for memory.
 CONTRAST = Limits(above=0.0, low=1e-3, at_most=20.0, hint="contrasts are natural logarithms: 0.2 is 22 %")
+#: Larger noise would cross thresholds of 1 all the time.
+CONTRAST_NOISE = Limits(at_least=0.0, at_most=1.0, hint="contrasts are natural logarithms: 0.02 is 2 %")
 CAPACITANCE = Limits(at_least=0.0, low=1e-18, at_most=1e-9, hint="capacitances are in farad: 1 fF is 1e-15")
 EVENT_RATE = Limits(at_least=0.0, at_most=1e9, hint="rates are per second and photosite")
 #: Sites per task; fixed, so that results do not depend on the number of threads.
@@ -154,6 +156,12 @@ class EventPixels(_Pixels):
         Rate of shot noise events of a site at zero photocurrent, with equal probabilities of both polarities.
     noise_half_e_per_s : float, e-/s
         Photocurrent at which the noise rate is half: ``noise_per_s / (1 + I / noise_half)``.
+    contrast_noise : float
+        Temporal noise at the comparator: standard deviation of a Gaussian number that is added to the change of the logarithm,
+        and drawn again at each event. It widens the S-curve of each site.
+    contrast_noise_changes_per_s : float, 1/s
+        Rate at which the contrast noise is also drawn between events, 2 pi times its corner frequency; its autocorrelation is
+        that of a first-order low pass. Large numbers cause noise events at constant irradiance.
     floor_e_per_s : float, e-/s
         Rate added to the photocurrent of every site, so that the logarithm is finite at zero irradiance.
 
@@ -166,10 +174,10 @@ class EventPixels(_Pixels):
     time; leakage lowers the reference. The frame rate should be so high that L changes little between frames.
 
     The initial phase of the leak of each site is random, drawn with the noise, so that leak events of different sites are not
-    synchronous. An event at the boundary of two frames belongs to the first.
+    synchronous and their rate is constant from the first frame. An event at the boundary of two frames belongs to the first.
 
     Noise events are a Poisson process with the refractory time as dead time; a noise event sets the reference like other
-    events.
+    events. :func:`event_probability` is the probability of an event after a step of irradiance.
 
     Examples
     --------
@@ -194,6 +202,8 @@ class EventPixels(_Pixels):
     leak_spread_fraction: Annotated[float, WIDE_SPREAD] = 0.0
     noise_per_s: Annotated[float, EVENT_RATE] = 0.0
     noise_half_e_per_s: Annotated[float, replace(RATE, above=0.0)] = 1e4
+    contrast_noise: Annotated[float, CONTRAST_NOISE] = 0.0
+    contrast_noise_changes_per_s: Annotated[float, EVENT_RATE] = 0.0
     floor_e_per_s: Annotated[float, RATE] = 1.0
 
     _noise_name: ClassVar[str] = "change events"
@@ -232,7 +242,7 @@ class EventPixels(_Pixels):
 
         tau_e = self.capacitance_f * BOLTZMANN_J_PER_K * self.temperature_k / ELEMENTARY_CHARGE_C**2
         (on, off), leaks_per_s = self.thresholds, self.leaks_per_s
-        memory = np.zeros((self.sensor.layout.n_sites, 4))
+        memory = np.zeros((self.sensor.layout.n_sites, 6))
         n_drawn = np.zeros(self.sensor.layout.n_sites, np.int64)
         n_before = 0
         last_current: Floats | None = None
@@ -265,6 +275,8 @@ class EventPixels(_Pixels):
                         tau_e,
                         self.noise_per_s,
                         self.noise_half_e_per_s,
+                        self.contrast_noise,
+                        self.contrast_noise_changes_per_s,
                         *key,
                         sites.start,
                         max_events,

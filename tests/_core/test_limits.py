@@ -54,6 +54,11 @@ EXAMPLES = {
     "psf": np.pad(np.ones((1, 1, 1, 1)), ((0, 0), (0, 0), (2, 2), (2, 2))),
     "x_um": [0.0],
     "y_um": [0.0],
+    "n_on": np.ones(9, np.int64),
+    "n_off": np.ones(9, np.int64),
+    "log_contrast": [0.1, 0.2],
+    "n_trials": [9, 9],
+    "n_responses": [1, 8],
 }
 #: Parameters that others require.
 COMPANIONS = {

@@ -592,6 +592,7 @@ CALLS = {
     "metrics.snr_by_class": lambda o: metrics.snr_by_class(o.simple, o.scene, exposure_s=0.01).plot(),
     "metrics.ssim": lambda o: metrics.ssim(PICTURE[..., 0] / 255.0, PICTURE[..., 1] / 255.0, data_range=1.0),
     "metrics.wave_vectors_per_mm": lambda o: metrics.wave_vectors_per_mm([1.0, 2.0]),
+    "modes.event_probability": lambda o: modes.event_probability([0.1, 0.2], 0.2, contrast_noise=0.02),
     "modes.write_events": lambda o: modes.write_events([o.events], o.path(".h5")),
     "modes.Events.read": lambda o: modes.Events.read(o.written(".txt", o.events.save), o.events.layout),
     "modes.Events.read aedat": lambda o: modes.Events.read(o.text(".aedat4", "#!AER-DAT4.0\r\n"), o.events.layout),
@@ -674,6 +675,12 @@ CALLS = {
     "tiles.write_tiles": lambda o: tiles.write_tiles(o.path(".zarr"), o.simple, o.scene, exposure_s=0.01, seed=0),
     "twin.compare_with": lambda o: o.twins.plot(),
     "twin.PictureComparison.to_pandas": lambda o: o.twins.to_pandas(),
+    "twin.fit_event_pixels": lambda o: fs.twin.fit_event_pixels(
+        fs.twin.StepResponses([0.1, 0.2, 0.3], [99] * 3, [2, 55, 98]), contrast_noise=0.0
+    ).plot(),
+    "twin.EventPixelFit.pixels": lambda o: fs.twin.fit_event_pixels(
+        static=[fs.twin.StaticRecording(np.full(9, 9), np.full(9, 2), bin_s=9.0)]
+    ).pixels(o.sensor, contrast_on=0.2, contrast_off=0.2, mismatch_fraction=0.0, contrast_noise=0.0),
     "units.decode_srgb": lambda o: units.decode_srgb(0.5),
     "units.electrons_to_volts": lambda o: units.electrons_to_volts(LENGTH, 1e-15),
     "units.encode_srgb": lambda o: units.encode_srgb(0.5),

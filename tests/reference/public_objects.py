@@ -19,6 +19,7 @@ from foveasim import (
     reconstruct,
     sensor,
     tiles,
+    twin,
     video,
     view,
 )
@@ -30,6 +31,7 @@ from foveasim.sensor import effects
 MANY = np.linspace(0.0, 1.0, 1000)
 TABLE = tuple(np.linspace(400.0, 700.0, 200))
 SITES = fs.layout.grid(40, 30, 2.0)
+STATIC = twin.StaticRecording(np.full((4, 60), 9), np.full((4, 60), 2), bin_s=10.0)
 OPTICS = fs.Optics(focal_length_mm=8.0, f_number=2.8)
 OPTICS_OVER_FIELD = fs.Optics(
     focal_length_mm=8.0, f_number=8.0, seidel=optics.Seidel(coma_um=0.5, field_radius_um=500.0), field_modes=2
@@ -136,6 +138,7 @@ def public_objects(directory):
         video.GazePath(np.arange(100.0), np.zeros((100, 2))),
         video.Recording(np.zeros((9, 1200)), MANY, np.arange(9), np.zeros((9, 2)), SITES, ("all",), np.zeros(1200, np.int64), 8, np.ones(1), {}, np.full(9, np.nan)),
         modes.EventPixels(SENSOR), modes.Events(np.zeros(3), np.zeros(3, np.int32), np.ones(3, np.int8), SITES),
+        twin.StepResponses(0.1 + 0.001 * MANY, np.full(MANY.size, 9), np.ones((MANY.size, 9), np.int64)), STATIC, twin.fit_event_pixels(static=[STATIC]),
         modes.Shutter(SITES, 0.1), modes.Exposure(modes.Shutter(SITES, 0.1), 0.05), modes.SpikingPixels(SENSOR, threshold_e=np.full(SITES.n_sites, 100.0)),
         metrics.AliasingSpectrum(**SPECTRUM, wave_per_mm=MANY[:2], amplitude=np.ones((9, 9)), baseband_fraction=1.0, alias_fraction=0.0, alias_per_mm=MANY[:2], noise_fraction=0.0),
         metrics.nyquist_vs_eccentricity(SITES), metrics.EdgeMtf(frequency_per_mm=MANY, mtf=MANY, mtf_sigma=MANY, angle_deg=5.0, offset_um=0.0, contrast=1.0, bin_um=0.5, pitch_um=2.0, distance_um=MANY, esf=MANY, n_sites=1000),
