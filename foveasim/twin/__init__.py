@@ -10,13 +10,13 @@ Real cameras and their simulation: from recorded frames or events to a sensor, a
 from __future__ import annotations
 
 from foveasim._core.calls import publish
-from foveasim.twin.camera_fit import fit
-from foveasim.twin.event_pixels import EventPixelFit, fit_event_pixels
-from foveasim.twin.event_recordings import StaticRecording, StepResponses
-from foveasim.twin.intervals import Estimate
-from foveasim.twin.pictures import Deviation, PictureComparison, compare_with
-from foveasim.twin.result import Twin, read_twin
-from foveasim.twin.stacks import Stack, read_stacks
+from foveasim.twin.events.pixels import EventPixelFit, fit_event_pixels
+from foveasim.twin.events.recordings import StaticRecording, StepResponses
+from foveasim.twin.frames.camera_fit import fit
+from foveasim.twin.frames.intervals import Estimate
+from foveasim.twin.frames.result import Twin, read_twin
+from foveasim.twin.frames.stacks import Stack, read_stacks
+from foveasim.twin.pictures.comparison import Deviation, PictureComparison, compare_with
 
 __all__ = [
     "Deviation",

@@ -176,7 +176,7 @@ def test_drawn_binomials_are_separated_by_pixel():
 def test_many_pixels_have_thresholds_of_their_own(monkeypatch):
     pixels = row(300)
     steps = record(pixels)
-    monkeypatch.setattr("foveasim.twin._s_curves.MAX_PIXELS", 100)
+    monkeypatch.setattr("foveasim.twin.events._s_curves.MAX_PIXELS", 100)
     fit = fit_event_pixels(steps)
 
     assert np.corrcoef(fit.thresholds_on, pixels.thresholds[0])[0, 1] > 0.9

@@ -12,13 +12,13 @@ import numpy as np
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.errors import ParameterError
 from foveasim.sensor.adc import ADC, QUANTISATION_DN2
-from foveasim.twin.chain import Chain, Spread
-from foveasim.twin.dark_current import DarkSpread, fit_dark_spread
-from foveasim.twin.intervals import Estimate, Uncertain, of_fraction, of_mean, of_squares, of_variance
-from foveasim.twin.levels import Levels, block_means, class_index
-from foveasim.twin.pooled import Exposures, PooledFit, fit_levels
-from foveasim.twin.statistics import StackStatistics
-from foveasim.twin.telegraph import TelegraphFit, fit_telegraph
+from foveasim.twin.frames.chain import Chain, Spread
+from foveasim.twin.frames.dark_current import DarkSpread, fit_dark_spread
+from foveasim.twin.frames.intervals import Estimate, Uncertain, of_fraction, of_mean, of_squares, of_variance
+from foveasim.twin.frames.levels import Levels, block_means, class_index
+from foveasim.twin.frames.pooled import Exposures, PooledFit, fit_levels
+from foveasim.twin.frames.statistics import StackStatistics
+from foveasim.twin.frames.telegraph import TelegraphFit, fit_telegraph
 
 __all__ = ["StackLight", "fit_statistics"]
 

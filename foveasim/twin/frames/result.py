@@ -21,8 +21,8 @@ from foveasim.layout.generators.grid import grid
 from foveasim.layout.readout import readout_by
 from foveasim.sensor import Sensor
 from foveasim.sensor.effects.measured import ColumnNoise, OffsetMap, ResponseMap, RowNoise, TelegraphMap
-from foveasim.twin.chain import SWING_V
-from foveasim.twin.intervals import Estimate, Uncertain
+from foveasim.twin.frames.chain import SWING_V
+from foveasim.twin.frames.intervals import Estimate, Uncertain
 from foveasim.units import ELEMENTARY_CHARGE_C
 
 __all__ = ["Twin", "read_twin"]
@@ -120,7 +120,8 @@ class Twin:
         layout : Layout, optional
             Other photosites. By default those of the camera, with the maps of its pixels; noise of the maps is reduced by
             taking each value in proportion to its reliability. Other layouts have patterns of the same statistics: full well,
-            dark current and steps of the ADC in electrons are proportional to the area of a site, read noise is that of the pixel.
+            dark current and steps of the ADC in electrons are proportional to the area of a site; read noise is that of the
+            pixel.
         **parameters
             Parameters of :class:`foveasim.Sensor`, such as ``filters`` and ``qe``, or values instead of estimated ones.
 

@@ -15,10 +15,10 @@ from foveasim._core.calls import Limits, OwnCheck
 from foveasim._io.npz import read_archive, write_archive
 from foveasim.errors import FoveasimError, FoveasimWarning, ParameterError, warn
 from foveasim.sensor.adc import BITS, LOG_STRENGTH, Companding
-from foveasim.twin.fitting import StackLight, fit_statistics
-from foveasim.twin.result import Twin, twin_of
-from foveasim.twin.stacks import Stack, read_stacks
-from foveasim.twin.statistics import StackStatistics, StackSums, sum_frames
+from foveasim.twin.frames.fitting import StackLight, fit_statistics
+from foveasim.twin.frames.result import Twin, twin_of
+from foveasim.twin.frames.stacks import Stack, read_stacks
+from foveasim.twin.frames.statistics import StackStatistics, StackSums, sum_frames
 
 __all__ = ["fit"]
 

@@ -26,7 +26,7 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout
 from foveasim.layout.rows import site_rows
 from foveasim.maps._npy import read_npy
-from foveasim.twin._target_scenes import undistorted
+from foveasim.twin.pictures._target_scenes import undistorted
 
 __all__ = ["FirstRow", "Raster", "check_unsaturated"]
 

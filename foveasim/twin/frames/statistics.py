@@ -45,7 +45,7 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
 
     Raises ParameterError when there are fewer than two frames, of different sizes, or of other numbers.
     """
-    from foveasim.twin import _kernels
+    from foveasim.twin.frames import _kernels
 
     batch: list[NDArray[Any]] = []
     total: StackSums | None = None

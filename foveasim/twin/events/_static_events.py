@@ -10,8 +10,8 @@ from foveasim._core.validation import Floats, Ints, read_only
 from foveasim.errors import ParameterError
 from foveasim.metrics.emva_intervals import CONFIDENCE, Jackknife
 from foveasim.modes.step_response import leak_events_per_s, noise_and_leak_per_s
-from foveasim.twin._s_curves import Found
-from foveasim.twin.event_recordings import StaticRecording
+from foveasim.twin.events._s_curves import Found
+from foveasim.twin.events.recordings import StaticRecording
 
 __all__ = ["fit_static", "noise_at"]
 

@@ -14,7 +14,7 @@ from foveasim._core.validation import Bools, Floats, Ints, read_only
 from foveasim.errors import ParameterError
 from foveasim.modes.pixels import MIN_THRESHOLD_FRACTION
 from foveasim.modes.step_response import log_no_event
-from foveasim.twin.event_recordings import StepResponses
+from foveasim.twin.events.recordings import StepResponses
 
 __all__ = ["POLARITY_OF", "QUANTILE", "Conditions", "Curve", "Found", "dead_pixels", "fit_steps", "log_none"]
 

@@ -24,9 +24,18 @@ from foveasim.modes.pixels import CONTRAST_NOISE, EVENT_RATE
 from foveasim.modes.step_response import contrast_noise_events_per_s, leak_part
 from foveasim.sensor import Sensor
 from foveasim.sensor.limits import SPREAD, TEMPERATURE
-from foveasim.twin._s_curves import POLARITY_OF, QUANTILE, Conditions, Curve, Found, dead_pixels, fit_steps, log_none
-from foveasim.twin._static_events import fit_static, noise_at
-from foveasim.twin.event_recordings import StaticRecording, StepResponses
+from foveasim.twin.events._s_curves import (
+    POLARITY_OF,
+    QUANTILE,
+    Conditions,
+    Curve,
+    Found,
+    dead_pixels,
+    fit_steps,
+    log_none,
+)
+from foveasim.twin.events._static_events import fit_static, noise_at
+from foveasim.twin.events.recordings import StaticRecording, StepResponses
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from foveasim.scene import Scene, charts
 from foveasim.scene._colorimetry import LUMINANCE_WEIGHTS, lab_of, patch_colours
 from foveasim.scene._illuminants import Illuminant
 from foveasim.scene.charts import PATCH_NAMES
-from foveasim.twin._target_scenes import WAVES_NM, WIDTHS_NM
+from foveasim.twin.pictures._target_scenes import WAVES_NM, WIDTHS_NM
 from foveasim.units import per_mm_from_per_um
 
 __all__ = ["CAMERAS", "SPATIAL", "Deviation", "DeviationTable", "Pair", "has_sites"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints
-from foveasim.twin.statistics import MAX_BLOCKS, StackStatistics
+from foveasim.twin.frames.statistics import MAX_BLOCKS, StackStatistics
 
 __all__ = ["Levels", "block_means", "block_weights", "class_index", "row_blocks"]
 

@@ -1,0 +1,1 @@
+"""Event pixels from recordings of a camera."""

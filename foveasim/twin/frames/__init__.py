@@ -1,0 +1,1 @@
+"""Sensors from frames of a camera."""

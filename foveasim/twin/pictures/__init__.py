@@ -1,0 +1,1 @@
+"""Real pictures of a target beside simulated ones."""
