@@ -44,6 +44,7 @@ from foveasim.sensor import (
 from foveasim.sensor import PRESETS as SENSOR_PRESETS
 from foveasim.sensor.effects import EFFECTS
 from foveasim.sensor.limits import EXPOSURE
+from foveasim.sensor.published.presets import with_changes
 from foveasim.sensor.spectral import CURVES
 from foveasim.video import GazePath
 
@@ -376,6 +377,7 @@ def _sensor() -> type[Section]:
         full_well_e=_PerSite | None,
         read_noise_e=_PerSite,
         capacitance_f=_PerSite | None,
+        gain_dn_per_e=float | list[float] | None,
         effects=list[_union_of("kind", effects)] if effects else list[Any],  # type: ignore[misc]
         disabled=list[str],
     )
@@ -392,7 +394,9 @@ def expand_preset(sensor: Any) -> Any:
     name = sensor.get("preset") if isinstance(sensor, Mapping) else None
     if not isinstance(name, str) or name not in SENSOR_PRESETS:
         return sensor
-    return SENSOR_PRESETS[name].settings() | {key: value for key, value in sensor.items() if key != "preset"}
+    return with_changes(
+        SENSOR_PRESETS[name].settings(), {key: value for key, value in sensor.items() if key != "preset"}
+    )
 
 
 def _layout_kind(section: Any) -> str | None:

@@ -36,6 +36,7 @@ from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.scene._scene import FRAMINGS
 from foveasim.sensor import Sensor
+from foveasim.sensor.limits import ALTERNATIVES
 from foveasim.video import GazePath
 from foveasim.video.frame_source import read_times
 
@@ -45,6 +46,8 @@ BUNDLED_PICTURE = "skimage:"
 YAML_EXTENSIONS = (".yaml", ".yml")
 #: Settings whose value may be a file.
 FILE_SETTINGS = ("density", "file", "gaze_path", "importance", "layers", "layout", "path", "picture", "times_s")
+#: Settings of a section that replace each other.
+REPLACED: Mapping[str, tuple[tuple[str, ...], ...]] = {"scene": (FRAMINGS,), "sensor": ALTERNATIVES}
 #: Option of the command line that replaces settings.
 CHANGE = "--set"
 #: Keys of a layout that take effect at its edits or later: they do not change the generated photosites.
@@ -722,7 +725,8 @@ def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: s
     """
     Set a value by its path, such as ``"sensor.bits"``, in place.
 
-    It replaces alternatives: a pixel pitch of the scene replaces its ``fit`` and field of view.
+    It replaces alternatives: a pixel pitch of the scene replaces its ``fit`` and field of view, a system gain of the sensor
+    its capacitance.
 
     Raises
     ------
@@ -763,10 +767,11 @@ def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: s
         if i < len(names) - 1:
             section = section[step]
     section[step] = value
-    if names[:-1] == ["scene"] and step in FRAMINGS and value is not None:
-        for name in FRAMINGS:
-            if name != step:
-                section.pop(name, None)
+    for group in REPLACED.get(".".join(names[:-1]), ()):
+        if step in group and value is not None:
+            for name in group:
+                if name != step:
+                    section.pop(name, None)
 
 
 def resolve_files(directory: Path, value: Any, key: str = "", found: list[Path] | None = None) -> Any:

@@ -337,7 +337,7 @@ class DataSheet:
             found["full_well_e"] = full_well_e * scale
         ranges = self._ranges
         if "dsnu_e" in ranges:
-            found["pixel_fpn_fraction"] = ranges["dsnu_e"].middle * self.gain / n_codes
+            found["dsnu_e"] = ranges["dsnu_e"].middle
         for name, parameter, factor in COPIED:
             if name in ranges:
                 found[parameter] = ranges[name].middle * factor

@@ -11,6 +11,7 @@ from typing import Any
 from foveasim._core.names import possible_names
 from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError
+from foveasim.sensor.limits import ALTERNATIVES
 from foveasim.units import ELEMENTARY_CHARGE_C
 
 __all__ = ["PRESETS", "Preset"]
@@ -67,6 +68,13 @@ class Preset:
     def settings(self) -> dict[str, Any]:
         """Return the parameters as in settings files."""
         return {**self.parameters, **{name: {"per_um2": value} for name, value in self.per_um2.items()}}
+
+
+def with_changes(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return parameters with changes, which also replace the same quantity in another unit."""
+    given = {name for name, value in changes.items() if value is not None}
+    replaced = {name for pair in ALTERNATIVES if given & {*pair} for name in pair}
+    return {name: value for name, value in values.items() if name not in replaced} | dict(changes)
 
 
 def find_preset(name: str) -> Preset:
