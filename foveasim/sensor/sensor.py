@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Limits, OwnCheck, Usual, check_declared
 from foveasim._core.names import CHANNEL_LETTERS, find_wrong_letter, possible_names
-from foveasim._core.provenance import large_arrays
+from foveasim._core.provenance import copy_plain_data, large_arrays
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import view_method
 from foveasim._core.threads import cached_property
@@ -195,6 +195,9 @@ class Sensor:
         the noise budget and all weights that depend on noise. A collection replaces the shot noise.
     disabled : sequence of str
         Names of effects to switch off, including those of keywords. Draws of the other effects do not change.
+    provenance : mapping, optional
+        Where the values come from, as plain data; empty by default. Of data sheets and presets: title, source, printed and
+        derived quantities, assumptions, and the names of replaced parameters. It has no effect on results.
 
     Raises
     ------
@@ -265,6 +268,7 @@ class Sensor:
     device_seed: Annotated[int, NOT_NEGATIVE] = 0
     effects: Sequence[Effect] = ()
     disabled: Iterable[str] = ()
+    provenance: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if not all(hasattr(self.layout, name) for name in ("n_sites", "channel", "columns")):
@@ -294,6 +298,7 @@ class Sensor:
                 "e-/s",
                 "check dark_reference_k and the parameters of dark_law",
             )
+        object.__setattr__(self, "provenance", MappingProxyType(copy_plain_data(dict(self.provenance or {}))))
         object.__setattr__(self, "effects", check_effects(self.effects))
         if self._own_collection is not None and (self.shot_noise, self.gaussian_above_e) != ("auto", 100.0):
             raise ParameterError(
@@ -359,14 +364,13 @@ class Sensor:
         >>> sensor = fs.Sensor.from_preset(
         ...     fs.layout.grid(n_x=4, n_y=3, pitch_um=3.45), "machine_vision"
         ... )
-        >>> (
-        ...     sensor.bits,
-        ...     round(float(sensor.capacitance_f[0] / 1.602176634e-19)),
-        ... )  # full well capacity at 1 V
-        (12, 10700)
+        >>> sensor.bits, sensor.provenance["printed"]["full_well_e"]
+        (12, '10700')
         """
         ideal = cls(layout)  # checks the layout
-        return cls(layout, **with_changes(find_preset(preset).values(ideal.layout.area_um2), parameters))
+        has_lines = "readout_line" in ideal.layout.columns
+        values = find_preset(preset).values(ideal.layout.area_um2, has_lines=has_lines)
+        return cls(layout, **with_changes(values, parameters))
 
     @classmethod
     def from_datasheet(
@@ -404,14 +408,15 @@ class Sensor:
         ... )
         >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.25)
         >>> sensor = fs.Sensor.from_datasheet(layout, sheet)
-        >>> sensor.bits, sensor.read_noise_e, sensor.pedestal_v * 4096
-        (12, 5.56, 240.0)
+        >>> sensor.bits, sensor.read_noise_e, sensor.provenance["derived"]["threshold_e"]
+        (12, 5.56, 'dark_noise_e, quantisation and 1/2')
         """
         if not isinstance(sheet, DataSheet | str | Path):
             raise ParameterError("sheet", f"must be a DataSheet, or the path of one, got {type_name(sheet)}")
         found = sheet if isinstance(sheet, DataSheet) else read_datasheet(sheet)
         ideal = cls(layout)  # checks the layout
-        return cls(layout, **with_changes(found.parameters(ideal.layout.area_um2), parameters))
+        has_lines = "readout_line" in ideal.layout.columns
+        return cls(layout, **with_changes(found.parameters(ideal.layout.area_um2, has_lines=has_lines), parameters))
 
     @classmethod
     def from_settings(

@@ -716,5 +716,4 @@ def test_unknown_preset_lists_those_that_exist():
 def test_preset_in_python_has_its_values():
     source = to_python(preset_settings(preset="mobile"))
 
-    assert "capacitance_f=3.5" in source
-    assert "preset" not in source
+    assert 'fs.Sensor.from_preset(layout, "mobile")' in source

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foveasim.config import get_setting, put_setting
-from foveasim.config._models import expand_preset
+from foveasim.config._objects import ELECTRONICS, with_electronics
 from foveasim.errors import FileError
 from foveasim.layout import LAYOUTS
 from foveasim.sensor import PRESETS
@@ -94,12 +95,18 @@ def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:
             del layout["edits"]
 
 
-def choose_preset(settings: dict[str, Any]) -> None:
-    """Replace the electronics of the sensor by those of its preset, without earlier values."""
+def choose_electronics(settings: dict[str, Any]) -> None:
+    """Replace the electronics by those of the preset or data sheet, without earlier values."""
     sensor = settings.get("sensor")
-    if isinstance(sensor, dict) and sensor.get("preset") is not None:
-        names = {name for preset in PRESETS.values() for name in preset.settings()}
-        settings["sensor"] = expand_preset({key: value for key, value in sensor.items() if key not in names})
+    if isinstance(sensor, dict) and any(sensor.get(name) is not None for name in ELECTRONICS):
+        others = {key: value for key, value in sensor.items() if key not in _electronic_names()}
+        settings["sensor"] = with_electronics(None, others)
+
+
+@cache
+def _electronic_names() -> frozenset[str]:
+    """Return the parameters that presets specify."""
+    return frozenset(name for preset in PRESETS.values() for name in preset.settings())
 
 
 def with_picture(settings: Mapping[str, Any], start: Mapping[str, Any], path: str) -> dict[str, Any]:

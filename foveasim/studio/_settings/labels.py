@@ -55,6 +55,9 @@ WORDS: dict[str, Words] = {
     "disabled": Words("disabled effects", synonyms="switch off without noise"),
     "distance_m": Words("scene distance", synonyms="object working"),
     "dnl_dn": Words("DNL", "Differential nonlinearity of the ADC: standard deviation of the code transitions."),
+    "datasheet": Words(
+        "data sheet", "File of a data sheet, whose values replace those of the sensor.", synonyms="emva electronics"
+    ),
     "dsnu_e": Words(
         "DSNU", "Standard deviation of dark frames over the sites, as in data sheets.", synonyms="fixed pattern emva"
     ),
