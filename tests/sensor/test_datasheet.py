@@ -236,12 +236,13 @@ def test_total_nonuniformity_follows_from_parts():
         DataSheet(**PLAIN | rows | {"dsnu_e": "20.0"})
 
 
-@pytest.mark.parametrize(("error_percent", "gain"), [("-1.133", "0.399"), ("-0.550", "0.399"), ("-3.00", "0.399")])
-def test_measurement_returns_linearity_error(error_percent, gain):
+@pytest.mark.parametrize(
+    ("min_percent", "max_percent"), [("-1.133", "0.595"), ("-0.550", None), ("-3.00", None), ("-0.32", "0.62")]
+)
+def test_measurement_returns_linearity_error(min_percent, max_percent):
     """By levels at equal distances, of a sensor whose codes reach far beyond its saturation."""
-    sheet = DataSheet(
-        **PLAIN | {"gain_dn_per_e": gain, "saturation_e": "8000", "linearity_error_min_percent": error_percent}
-    )
+    linearity = {"linearity_error_min_percent": min_percent, "linearity_error_max_percent": max_percent}
+    sheet = DataSheet(**PLAIN | {"gain_dn_per_e": "0.399", "saturation_e": "8000"} | linearity)
     sensor = fs.Sensor.from_datasheet(fs.layout.grid(n_x=200, n_y=200, pitch_um=3.45), sheet)
     signals_e = 8000.0 * np.arange(1, 54) / 50.0
 
@@ -252,16 +253,20 @@ def test_measurement_returns_linearity_error(error_percent, gain):
     light = [frames(each, k) for k, each in enumerate(signals_e)]
     found = fs.metrics.emva1288(light, [frames(0.0, 99)], signals_e / 0.64)
 
-    assert 100.0 * found.linearity_error_min_fraction[0] == pytest.approx(float(error_percent), rel=0.05)
+    errors_percent = [
+        100.0 * each[0] for each in (found.linearity_error_min_fraction, found.linearity_error_max_fraction)
+    ]
+    assert errors_percent[0] == pytest.approx(float(min_percent), rel=0.05)
+    assert max_percent is None or errors_percent[1] == pytest.approx(float(max_percent), rel=0.05)
     assert found.gain_dn_per_e[0] == pytest.approx(0.399, rel=0.01)
     assert found.qe[0] == pytest.approx(0.64, rel=0.01)
     assert found.saturation_e[0] == pytest.approx(8000.0, rel=0.02)  # a step of the levels
 
 
 def test_linearity_error_of_no_sensor_is_said():
-    sheet = DataSheet(**PLAIN, linearity_error_min_percent="-0.2", linearity_error_max_percent="2.5")
+    sheet = DataSheet(**PLAIN, linearity_error_min_percent="-2.0", linearity_error_max_percent="2.5")
 
-    assert any("not linearity_error_min_percent = -0.2, linearity_error_max" in each for each in sheet.assumptions)
+    assert any("not linearity_error_min_percent = -2.0, linearity_error_max" in each for each in sheet.assumptions)
 
 
 def test_full_well_limits_the_charge():

@@ -31,7 +31,7 @@ from foveasim.sensor.published.response import (
     Response,
     limit_of_saturation,
     linearity_errors,
-    loss_of_linearity_error,
+    loss_of_linearity_errors,
     response_of,
     saturation_of_limit,
 )
@@ -425,13 +425,9 @@ class DataSheet:
 
     @cached_property
     def _response(self) -> Response:
-        """Response with the linearity error: the smallest deviation, or else the largest."""
-        for name in LINEARITY:
-            error = self._printed.get(name, NOTHING).value
-            loss = loss_of_linearity_error(0.01 * error) if error else None
-            if loss is not None:
-                return response_of(loss)
-        return response_of(0.0)
+        """Response with the linearity error; linear without one, or with a larger one than any quadratic response."""
+        smallest, largest = (0.01 * self._printed.get(name, NOTHING).value for name in LINEARITY)
+        return response_of(loss_of_linearity_errors(smallest, largest) or 0.0)
 
     @property
     def _signal_fraction(self) -> float:
@@ -496,9 +492,9 @@ class DataSheet:
         normal distribution, and Q = 1 - Φ(z); with PRNU, in the mean over sites, whose μ differ. Where the codes end before
         this full well, they limit the charge.
 
-        A linearity error is that of a quadratic response, whose relative loss at saturation causes the smallest deviation of
-        the sheet. Gain, quantum efficiency and charges are then those at zero signal, of which EMVA 1288 measures slopes up to
-        70 % of saturation.
+        A linearity error is that of a quadratic response, whose relative loss at saturation causes the larger deviation of
+        the sheet, at 50 levels. Gain, quantum efficiency and charges are then those at zero signal, of which EMVA 1288
+        measures slopes up to 70 % of saturation.
         """
         n_codes, ranges, response = 2**self.bits, self._ranges, self._response
         gain, per_um2 = self.gain / response.gain, self.value("pixel_um") ** -2

@@ -70,20 +70,23 @@ def linearity_errors(loss_fraction: float) -> tuple[float, float]:
 
 
 @cache
-def loss_of_linearity_error(error_fraction: float) -> float | None:
+def loss_of_linearity_errors(min_fraction: float, max_fraction: float) -> float | None:
     """
-    Return the loss at saturation of a linearity error; None if no loss has it.
+    Return the loss at saturation of linearity errors, 0 for an unknown one; None if no loss has them.
 
-    A negative error is the smallest deviation, a positive one the largest.
+    The error of larger magnitude is that at the ends of the range: the smallest deviation of a response that saturates, with
+    a positive loss, and the largest of one that rises.
     """
     from scipy import optimize
 
-    k = 0 if error_fraction < 0.0 else 1
-    if abs(linearity_errors(MAX_LOSS)[k]) <= abs(error_fraction):
+    rises = max_fraction > -min_fraction and min_fraction < 0.0
+    k, error_fraction = (0, min_fraction) if min_fraction < 0.0 and not rises else (1, max_fraction)
+    end = -MAX_LOSS if rises else MAX_LOSS
+    if error_fraction == 0.0:
+        return 0.0
+    if abs(linearity_errors(end)[k]) <= abs(error_fraction):
         return None
-    return float(
-        optimize.brentq(lambda loss_fraction: linearity_errors(loss_fraction)[k] - error_fraction, 0.0, MAX_LOSS)
-    )
+    return float(optimize.brentq(lambda loss: linearity_errors(loss)[k] - error_fraction, min(0.0, end), max(0.0, end)))
 
 
 @cache
