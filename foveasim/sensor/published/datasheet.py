@@ -425,7 +425,7 @@ class DataSheet:
 
     @cached_property
     def _response(self) -> Response:
-        """Response with the linearity error; linear without one, or with a larger one than any quadratic response."""
+        """Response with the linearity errors; linear where no quadratic one has them."""
         smallest, largest = (0.01 * self._printed.get(name, NOTHING).value for name in LINEARITY)
         return response_of(loss_of_linearity_errors(smallest, largest) or 0.0)
 

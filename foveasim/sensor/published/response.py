@@ -72,10 +72,10 @@ def linearity_errors(loss_fraction: float) -> tuple[float, float]:
 @cache
 def loss_of_linearity_errors(min_fraction: float, max_fraction: float) -> float | None:
     """
-    Return the loss at saturation of linearity errors, 0 for an unknown one; None if no loss has them.
+    Return the loss at saturation of linearity errors; None if no loss has them.
 
-    The error of larger magnitude is that at the ends of the range: the smallest deviation of a response that saturates, with
-    a positive loss, and the largest of one that rises.
+    An unknown error is 0. The error of larger magnitude is that at the ends of the range: the smallest deviation of a response
+    that saturates, with a positive loss, and the largest of one that rises.
     """
     from scipy import optimize
 
