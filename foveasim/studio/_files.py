@@ -61,6 +61,13 @@ def with_values(settings: dict[str, Any], path: str | Path) -> dict[str, Any]:
     return {**settings, "sensor": with_electronics(path, settings["sensor"])} if "sensor" in settings else settings
 
 
+def with_preset(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings with the values of the sensor's preset; a data sheet is not read."""
+    sensor = settings.get("sensor")
+    has_sheet = isinstance(sensor, Mapping) and sensor.get("datasheet") is not None
+    return settings if has_sheet or sensor is None else {**settings, "sensor": with_electronics(None, sensor)}
+
+
 def preset_paths() -> dict[str, Path]:
     """Return the files of the bundled shots and layouts, by name."""
     shots = {f"shot:{path.stem}": path for path in demo_settings()}
@@ -229,7 +236,9 @@ class Files:
         Raises FileError when the file is not available, or not valid YAML.
         """
         self.available(path)
-        return resolve_files(Path(path).parent, with_values(read_settings(path), path))
+        settings: dict[str, Any] = resolve_files(Path(path).parent, read_settings(path))
+        self.check(settings.get("sensor"), "sensor")  # before its data sheet is read
+        return with_values(settings, path)
 
     def layout_of(self, path: str) -> Any:
         """

@@ -13,7 +13,7 @@ from foveasim._io.yaml_files import read_text, read_yaml
 from foveasim.config import resolve_files
 from foveasim.errors import FileError, FoveasimError, ParameterError, printable
 from foveasim.studio._engine import Simulated
-from foveasim.studio._files import file_name, unused_path, with_values
+from foveasim.studio._files import file_name, unused_path, with_preset
 from foveasim.studio._messages.models import ApplyVariant, ChangeVariant, CompareVariants, Freeze, Unfreeze, handles
 from foveasim.studio._parts import PARTS, summary_of
 from foveasim.studio._parts.comparison import FROZEN
@@ -121,7 +121,7 @@ class Variants:
         settings = read_yaml(path)
         if not isinstance(settings, dict):
             raise FileError(path, "must contain the settings of a shot")
-        return dict(resolve_files(path.parent.absolute(), with_values(settings, path)))
+        return dict(resolve_files(path.parent.absolute(), with_preset(settings)))
 
 
 def _files_of(path: Path) -> set[Path]:

@@ -96,11 +96,15 @@ def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:
 
 
 def choose_electronics(settings: dict[str, Any]) -> None:
-    """Replace the electronics by those of the preset or data sheet, without earlier values."""
+    """
+    Replace the electronics by those of the preset or data sheet, without earlier values.
+
+    A data sheet is read with the other files of the settings, which are checked before.
+    """
     sensor = settings.get("sensor")
     if isinstance(sensor, dict) and any(sensor.get(name) is not None for name in ELECTRONICS):
         others = {key: value for key, value in sensor.items() if key not in _electronic_names()}
-        settings["sensor"] = with_electronics(None, others)
+        settings["sensor"] = others if others.get("datasheet") is not None else with_electronics(None, others)
 
 
 @cache
