@@ -8,7 +8,7 @@ from scipy import stats
 
 import foveasim as fs
 from foveasim.sensor import DataSheet, read_datasheet
-from foveasim.sensor.published.datasheet import QUANTITIES, _range_of, limit_of_saturation
+from foveasim.sensor.published.datasheet import PARAMETERS, QUANTITIES, _range_of, limit_of_saturation
 
 #: A sheet with the quantities that a sensor needs.
 PLAIN = {"pixel_um": 3.45, "bits": 12, "qe_percent": 64, "dark_noise_e": "2.1", "saturation_e": 10_400}
@@ -315,6 +315,7 @@ def test_published_sheets_are_grouped_and_consistent():
         assert preset.sheet is not None
         assert preset.sheet.title == preset.title == SHEETS[name]["title"]
         assert preset.provenance["source"] == preset.source
+        assert preset.settings().keys() <= PARAMETERS
 
 
 def test_misprint_is_found():

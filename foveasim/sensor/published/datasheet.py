@@ -667,6 +667,13 @@ COPIED = (
     ("temperature_k", "dark_reference_k", 1.0),
     ("doubling_k", "dark_doubling_k", 1.0),
 )
+#: Parameters of sensors that data sheets specify.
+PARAMETERS = frozenset(
+    {
+        "bits", "capacitance_f", "dark_e_per_s", "dsnu_e", "full_well_e", "line_fpn_fraction", "nonlinearity_fraction",
+        "pedestal_v", "provenance", "qe", "read_noise_e", "v_sat_v", *(parameter for _, parameter, _ in COPIED),
+    }
+)  # fmt: skip
 #: What a sensor has where a data sheet contains no value.
 OPEN: Mapping[str, str] = MappingProxyType(
     {

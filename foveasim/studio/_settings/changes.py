@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,8 @@ from foveasim.config._objects import ELECTRONICS, with_electronics
 from foveasim.errors import FileError
 from foveasim.layout import LAYOUTS
 from foveasim.sensor import PRESETS
+from foveasim.sensor.limits import ALTERNATIVES
+from foveasim.sensor.published.datasheet import PARAMETERS
 from foveasim.studio._files import with_layout
 from foveasim.studio._messages.models import DeleteValue, OpenFile, ResetValue, handles
 from foveasim.studio._settings.controls import controls_of
@@ -24,6 +25,8 @@ from foveasim.studio._settings.uses import PLACES, use_of
 if TYPE_CHECKING:
     from foveasim.studio._session import Session
 
+#: Parameters of the electronics, which a preset or data sheet replaces.
+ELECTRONIC = PARAMETERS.union(*ALTERNATIVES, *(preset.parameters for preset in PRESETS.values()))
 #: Filters that a layout receives: a mosaic, or a colouring of the sites.
 MOSAIC = ["RG", "GB"]
 COLOURING = {"kind": "graph_colouring", "n_channels": 3}
@@ -103,14 +106,8 @@ def choose_electronics(settings: dict[str, Any]) -> None:
     """
     sensor = settings.get("sensor")
     if isinstance(sensor, dict) and any(sensor.get(name) is not None for name in ELECTRONICS):
-        others = {key: value for key, value in sensor.items() if key not in _electronic_names()}
+        others = {key: value for key, value in sensor.items() if key not in ELECTRONIC}
         settings["sensor"] = others if others.get("datasheet") is not None else with_electronics(None, others)
-
-
-@cache
-def _electronic_names() -> frozenset[str]:
-    """Return the parameters that presets specify."""
-    return frozenset(name for preset in PRESETS.values() for name in preset.settings())
 
 
 def with_picture(settings: Mapping[str, Any], start: Mapping[str, Any], path: str) -> dict[str, Any]:
