@@ -398,6 +398,18 @@ def test_electronics_are_replaced_by_a_preset(recorder):
     assert "pedestal_v" not in sensor  # of the preset before
 
 
+def test_quantum_efficiency_remains_without_another(recorder):
+    """That of a preset without one; the data sheet of the IMX273 has 64 %."""
+    qe = {"kind": "silicon", "depth_um": 4.0}
+    recorder.do(do="set", key="sensor.qe", value=qe, final=True)
+    found = [
+        recorder.do(do="set", key="sensor.preset", value=name, final=True)["settings"]["sensor"]["qe"]
+        for name in ("mobile", "imx273")
+    ]
+
+    assert found == [qe, 0.64]
+
+
 def test_restored_settings_give_same_codes(recorder, make_session):
     recorder.do(do="set", key="optics.f_number", value=22.5, final=True)
     recorder.do(do="set", key="optics.focus_distance_m", value=".inf", final=True)

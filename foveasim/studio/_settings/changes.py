@@ -102,12 +102,16 @@ def choose_electronics(settings: dict[str, Any]) -> None:
     """
     Replace the electronics by those of the preset or data sheet, without earlier values.
 
-    A data sheet is read with the other files of the settings, which are checked before.
+    A data sheet is read with the other files of the settings, which are checked before. A quantum efficiency remains with a
+    preset that has none.
     """
     sensor = settings.get("sensor")
     if isinstance(sensor, dict) and any(sensor.get(name) is not None for name in ELECTRONICS):
         others = {key: value for key, value in sensor.items() if key not in ELECTRONIC}
-        settings["sensor"] = others if others.get("datasheet") is not None else with_electronics(None, others)
+        if others.get("datasheet") is None:
+            earlier = {name: value for name, value in sensor.items() if name == "qe"}
+            others = {**earlier, **with_electronics(None, others)}
+        settings["sensor"] = others
 
 
 def with_picture(settings: Mapping[str, Any], start: Mapping[str, Any], path: str) -> dict[str, Any]:
