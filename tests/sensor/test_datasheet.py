@@ -12,7 +12,7 @@ from foveasim.sensor.published.datasheet import PARAMETERS, QUANTITIES, _range_o
 
 #: A sheet with the quantities that a sensor needs.
 PLAIN = {"pixel_um": 3.45, "bits": 12, "qe_percent": 64, "dark_noise_e": "2.1", "saturation_e": 10_400}
-N_SIDE, N_FRAMES, EXPOSURE_S = 300, 4, 0.01
+N_SIDE, N_FRAMES, EXPOSURE_S = 300, 4, 1e-4
 
 
 def measured(sensor, saturation_e):
@@ -155,7 +155,7 @@ def test_what_is_open_is_said():
     assert DataSheet(**SHEETS["imx900_high_gain"]).assumptions == (
         "The quantum efficiency at 536 nm holds at all wavelengths.",
         "A sensor does not contain shutter, global.",
-        "The dark current doubles every 8 K.",
+        "The dark current doubles every 8 K, the default of sensors.",
     )
 
 
@@ -236,6 +236,7 @@ def test_total_nonuniformity_follows_from_parts():
         DataSheet(**PLAIN | rows | {"dsnu_e": "20.0"})
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize(
     ("min_percent", "max_percent"), [("-1.133", "0.595"), ("-0.550", None), ("-3.00", None), ("-0.32", "0.62")]
 )
@@ -280,6 +281,8 @@ def test_full_well_limits_the_charge():
         assert (codes - sheet.black_dn) / sheet.gain == pytest.approx(limit_e, rel=0.005)
         assert limit_of_saturation(sheet.value("saturation_e")) == pytest.approx(limit_e, rel=0.005)
     assert sheets[1].derived["saturation_e"].endswith("or the end of the codes")
+    # At 2.005 e-/DN, the largest gain that is printed as 2.00.
+    assert "The codes end at 8198 e-, before the full well." in sheets[1].assumptions
 
 
 def test_range_of_noise_is_recognised():

@@ -352,6 +352,8 @@ class DataSheet:
         reached_e = saturation_of_limit(self._end_e, self._prnu) / self._response.true_fraction
         if reached_e < (1.0 - ROUND_FRACTION) * self.value("saturation_e"):
             found.append(f"The codes end so early that the saturation of the sensor is {reached_e:.4g} e-.")
+        if self._has_well and self._end_e < (1.0 - ROUND_FRACTION) * self._limit_e:
+            found.append(f"The codes end at {self._end_e:.4g} e-, before the full well.")
         found += self._linearity_sentences()
         for name in ("dsnu_row_e", "prnu_row_percent", "prnu_column_percent"):
             if self._printed.get(name, NOTHING).high > 0.0:
@@ -677,11 +679,11 @@ PARAMETERS = frozenset(
 #: What a sensor has where a data sheet contains no value.
 OPEN: Mapping[str, str] = MappingProxyType(
     {
-        "dsnu_e": "There is no DSNU.",
-        "prnu_percent": "There is no PRNU.",
-        "dark_current_e_per_s": "There is no dark current.",
-        "temperature_k": "The temperature is 300 K.",
-        "doubling_k": "The dark current doubles every 8 K.",
+        "dsnu_e": "There is no DSNU, since the sheet has none.",
+        "prnu_percent": "There is no PRNU, since the sheet has none.",
+        "dark_current_e_per_s": "There is no dark current, since the sheet has none.",
+        "temperature_k": "The temperature is 300 K, the default of sensors.",
+        "doubling_k": "The dark current doubles every 8 K, the default of sensors.",
     }
 )
 
