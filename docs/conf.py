@@ -161,6 +161,7 @@ def setup(app: Sphinx) -> None:
         generated_pages.write_reference,
         generated_pages.write_reference_figures,
         generated_pages.write_layouts,
+        generated_pages.write_published_sensors,
         generated_pages.write_gallery,
     ):
         app.connect("config-inited", write)

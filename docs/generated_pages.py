@@ -35,6 +35,7 @@ from foveasim._io.yaml_files import first_comment
 from foveasim.config import bundled_layouts, read_layout_file
 from foveasim.layout import LAYOUTS
 from foveasim.scene import SCENES
+from foveasim.sensor import PRESETS
 from foveasim.view import plot_layout
 
 if TYPE_CHECKING:
@@ -475,6 +476,33 @@ def write_layouts(_app: Sphinx, _config: Config) -> None:
     (BUNDLED / "index.md").write_text(
         "\n\n".join(["# Bundled layouts", about, *sections]) + "\n"
     )
+
+
+def write_published_sensors(_app: Sphinx, _config: Config) -> None:
+    """Write the table of published sensors, which the guide of sensor parameters includes."""
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "published_sensors.txt").write_text(table_of_sensors() + "\n")
+
+
+def table_of_sensors() -> str:
+    """Return the presets of measured sensors as a table, with values as they are printed."""
+    columns = {
+        "pixel, µm": ("pixel_um",),
+        "bits": ("bits",),
+        "QE, %": ("qe_percent",),
+        "dark noise, e-": ("dark_noise_e",),
+        "saturation, e-": ("saturation_e", "full_well_e"),
+    }
+    rows = [["preset", *columns, "sensor and source"], ["---"] * (len(columns) + 2)]
+    for name, preset in PRESETS.items():
+        if preset.sheet is None:
+            continue
+        cells = [f"`{name}`"]
+        for quantities in columns.values():
+            printed = [preset.quantities.get(each) for each in quantities]
+            cells.append(next((str(each) for each in printed if each is not None), ""))
+        rows.append([*cells, f"{preset.title}. {preset.source}"])
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
 
 
 def figure_of(layout: Layout) -> Figure:

@@ -709,17 +709,52 @@ def schema(
 
 @app.command()
 def new(
-    kind: Annotated[str, typer.Argument(help=f"Kind of file: {KINDS}.")],
+    kind: Annotated[str, typer.Argument(help=f"Kind of file: {KINDS}; or sensor with --from-datasheet.")],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="File to write, by default KIND.yaml in this directory.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    from_datasheet: Annotated[
+        bool,
+        typer.Option(
+            "--from-datasheet", help="With the kind sensor: a data sheet, and a shot whose sensor has its values."
+        ),
+    ] = False,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Quantity of the data sheet, for example dark_noise_e=5.56; repeatable."),
+    ] = None,
 ) -> None:
     """Write a commented settings file to start from."""
     from foveasim.config import starting_command, write_starting_file
 
+    if from_datasheet or kind == "sensor" or changes:
+        _new_sensor(kind, out, changes or (), force=force, from_datasheet=from_datasheet)
+        return
     path = write_starting_file(kind, out, force=force)
     _report(f"wrote {path}; next: {starting_command(kind, path)}")
+
+
+def _new_sensor(kind: str, out: Path | None, changes: Sequence[str], *, force: bool, from_datasheet: bool) -> None:
+    """Write the files of a sensor; without quantities, a terminal asks for them."""
+    from foveasim.config import starting_command, write_sensor_files
+    from foveasim.config._new_sensor import asked_quantities, quantities_of
+
+    if kind != "sensor" or not from_datasheet:
+        raise FoveasimError(
+            "--from-datasheet and the kind sensor belong together: foveasim new sensor --from-datasheet"
+        )
+    if not changes and not sys.stdin.isatty():
+        raise FoveasimError(
+            "the quantities of the data sheet must be given as --set NAME=VALUE, or be typed in a terminal"
+        )
+
+    def ask(question: str) -> str:
+        return str(typer.prompt(question, default="", show_default=False))
+
+    quantities = quantities_of(changes) if changes else asked_quantities(ask, _report_error)
+    sheet, shot = write_sensor_files(quantities, out, force=force)
+    _report(f"wrote {sheet} and {shot}; next: {starting_command('shot', shot)}")
 
 
 def _reading_options(

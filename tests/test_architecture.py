@@ -59,6 +59,7 @@ DIMENSIONLESS = {
     "confidence", "curves", "difference", "light_factor", "real", "regions", "simulated", "limit", "limits", "log_strength", "low", "magnification", "matrix", "median", "min_coverage", "misfit", "missing", "mtf", "mtf_sigma", "mu", "max_aspect_ratio", "obscuration", "offset",
     "contrast_noise", "log_contrast", "threshold", "thresholds_off", "thresholds_on", "intervals",
     "max_density", "max_growth", "max_neighbour_ratio", "max_track_utilisation", "min_density", "min_growth", "neighbour_fraction", "noisy_ratio", "out", "p1", "p2", "peak", "per_vertex", "percentile", "power", "dynamic_range_db", "prnu_percent", "psnr_db", "psnr_db_by_eccentricity", "qe_percent", "snr_max_db", "value_db", "qe", "ratio", "reflectance", "refractive_index", "response", "rounding", "s1", "s2", "s3", "s4", "xi",
+    "linearity_error_max_percent", "linearity_error_min_percent", "noise_dynamic_range_db", "prnu_column_percent", "prnu_pixel_percent", "prnu_row_percent", "qe_curve",
     "result", "result_at", "results", "ring_ratio", "sensitivity", "site_weights", "snr", "spectrum", "ssim", "ssim_by_eccentricity", "stretch", "target", "tolerance", "transmission", "value", "values", "variance", "wavelength", "weight", "weights", "white", "worst_area_error", "zoom",
 }  # fmt: skip
 #: Names in private functions, in cells, pitches, steps or aperture radii as their docstrings specify.

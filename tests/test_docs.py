@@ -256,6 +256,17 @@ def test_registries_are_described_by_their_entries(generators):
     assert generators["comment_on"]("LAYOUTS", "foveasim.layout").startswith("Layout generators by their name")
 
 
+def test_table_of_sensors_has_their_sources(generators):
+    lines = generators["table_of_sensors"]().splitlines()
+    published = {name: preset for name, preset in foveasim.sensor.PRESETS.items() if preset.group != "paper"}
+
+    assert len(lines) == 2 + len(published)
+    for line, (name, preset) in zip(lines[2:], published.items(), strict=True):
+        assert line.startswith(f"| `{name}` | {preset.quantities['pixel_um']} | ")
+        assert preset.source in line
+        assert line.count(" | ") == 6
+
+
 def test_constants_are_described(generators):
     public = generators["public_names"]()
     comments = {

@@ -50,6 +50,7 @@ MIN_WAVELENGTH_NM, MAX_WAVELENGTH_NM = 10.0, 1e6
 UNIT_SUFFIXES = {
     "_fraction": "",
     "_dn_per_ph": "DN per photon",
+    "_dn_per_e": "DN/e-",
     "_dn2": "DN²",
     "_e2": "e-²",
     "_ph": "photons",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from foveasim._core.calls import Limits, Usual, Words, publish
 from foveasim.config._comparing import compare_files
+from foveasim.config._new_sensor import write_sensor_files
 from foveasim.config._objects import (
     YAML_EXTENSIONS,
     LayoutFile,
@@ -85,6 +86,7 @@ __all__ = [
     "validate",
     "write_3d_picture",
     "write_results",
+    "write_sensor_files",
     "write_starting_file",
 ]
 

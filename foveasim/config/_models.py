@@ -14,7 +14,7 @@ from dataclasses import asdict
 from functools import lru_cache
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_type_hints
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, create_model
 
 from foveasim._core.calls import NOT_NEGATIVE, Declaration, Usual
 from foveasim._core.calls.docstrings import Docstring
@@ -376,23 +376,20 @@ def _sensor() -> type[Section]:
         full_well_e=_PerSite | None,
         read_noise_e=_PerSite,
         capacitance_f=_PerSite | None,
+        gain_dn_per_e=float | list[float] | None,
         effects=list[_union_of("kind", effects)] if effects else list[Any],  # type: ignore[misc]
         disabled=list[str],
+        provenance=Annotated[dict[str, Any] | None, Field(json_schema_extra={"readOnly": True})],
     )
     preset: Any = (
         Literal[tuple(SENSOR_PRESETS)] | None,
         Field(None, description="published electronics, whose values other keys replace: foveasim.sensor.PRESETS"),
     )
-    validators: Any = {"expand_preset": model_validator(mode="before")(expand_preset)}
-    return create_model("sensor", __base__=sensor, __doc__=sensor.__doc__, __validators__=validators, preset=preset)
-
-
-def expand_preset(sensor: Any) -> Any:
-    """Return the settings of a sensor with the values of its preset."""
-    name = sensor.get("preset") if isinstance(sensor, Mapping) else None
-    if not isinstance(name, str) or name not in SENSOR_PRESETS:
-        return sensor
-    return SENSOR_PRESETS[name].settings() | {key: value for key, value in sensor.items() if key != "preset"}
+    datasheet: Any = (
+        str | None,
+        Field(None, description="file of a data sheet, whose values other keys replace: foveasim.sensor.DataSheet"),
+    )
+    return create_model("sensor", __base__=sensor, __doc__=sensor.__doc__, preset=preset, datasheet=datasheet)
 
 
 def _layout_kind(section: Any) -> str | None:

@@ -35,7 +35,10 @@ from foveasim.layout.files import read_layout as read_sites
 from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.scene._scene import FRAMINGS
-from foveasim.sensor import Sensor
+from foveasim.sensor import PRESETS as SENSOR_PRESETS
+from foveasim.sensor import DataSheet, Sensor, read_datasheet
+from foveasim.sensor.limits import ALTERNATIVES
+from foveasim.sensor.published.presets import with_changes
 from foveasim.video import GazePath
 from foveasim.video.frame_source import read_times
 
@@ -44,7 +47,25 @@ BUNDLED_PICTURE = "skimage:"
 #: Extensions of settings files; the format of other layout files follows from their content.
 YAML_EXTENSIONS = (".yaml", ".yml")
 #: Settings whose value may be a file.
-FILE_SETTINGS = ("density", "file", "gaze_path", "importance", "layers", "layout", "path", "picture", "times_s")
+FILE_SETTINGS = (
+    "datasheet",
+    "density",
+    "file",
+    "gaze_path",
+    "importance",
+    "layers",
+    "layout",
+    "path",
+    "picture",
+    "times_s",
+)
+#: Keys of a sensor with the origin of its values, which its other keys replace.
+ELECTRONICS = ("preset", "datasheet")
+#: Settings of a section that replace each other.
+REPLACED: Mapping[str, tuple[tuple[str, ...], ...]] = {
+    "scene": (FRAMINGS,),
+    "sensor": (*ALTERNATIVES, ELECTRONICS),
+}
 #: Option of the command line that replaces settings.
 CHANGE = "--set"
 #: Keys of a layout that take effect at its edits or later: they do not change the generated photosites.
@@ -293,12 +314,22 @@ def build_shot(
         return read
 
     def sensor_of_layout() -> Sensor:
-        values = {
+        section = settings.sensor
+        origins = [name for name in ELECTRONICS if getattr(section, name) is not None]
+        arguments: dict[str, Any] = {
             name: value.per_um2 * layout.area_um2 if isinstance(value, PerArea) else value
-            for name, value in _values(source, "sensor.", settings.sensor).items()
-            if name != "preset"  # already expanded into its values
+            for name, value in _values(source, "sensor.", section).items()
+            if name not in ELECTRONICS and (not origins or name in section.model_fields_set)
         }
-        sensor: Sensor = _call(source, "sensor", Sensor, {"layout": layout, **values})
+        make: Callable[..., Sensor] = Sensor
+        match origins:
+            case ["preset"]:
+                make, arguments["preset"] = Sensor.from_preset, section.preset
+            case ["datasheet"]:
+                make, arguments["sheet"] = Sensor.from_datasheet, sheet_of(source, section.datasheet)
+            case [_, _]:
+                raise source.error("sensor.datasheet", "must not be given together with 'preset'; remove one of them")
+        sensor: Sensor = _call(source, "sensor", make, {"layout": layout, **arguments})
         return sensor
 
     file = cache("layout", data["layout"], layout_file)
@@ -344,6 +375,35 @@ def build_shot(
         if "encoding" in settings.scene.model_fields_set
         else None,
     )
+
+
+def sheet_of(source: Source, path: str) -> DataSheet:
+    """Return the data sheet of a file in settings; errors have the lines of both files."""
+    file = source.directory / path
+    try:
+        return read_datasheet(file)
+    except ParameterError as error:
+        raise source.error("sensor.datasheet", str(Source.of(file).error(error.name, error.detail))) from None
+    except FoveasimError as error:
+        raise source.error("sensor.datasheet", str(error)) from None
+
+
+def with_electronics(source: Source | str | Path | None, sensor: Any) -> Any:
+    """
+    Return the settings of a sensor with the values of its preset or data sheet.
+
+    For sites without readout lines. Settings that :func:`build_shot` rejects are returned unchanged.
+    """
+    if not isinstance(sensor, Mapping):
+        return sensor
+    given = [name for name in ELECTRONICS if sensor.get(name) is not None]
+    if len(given) != 1 or not isinstance(origin := sensor[given[0]], str):
+        return sensor
+    if given == ["preset"] and origin not in SENSOR_PRESETS:
+        return sensor
+    electronics = SENSOR_PRESETS[origin] if given == ["preset"] else sheet_of(Source.of(source), origin)
+    others = {name: value for name, value in sensor.items() if name not in ELECTRONICS}
+    return with_changes(electronics.settings(), others)
 
 
 def _gaze_source(source: Source, rows: list[list[float]] | str | None) -> GazePath | Path | None:
@@ -722,7 +782,8 @@ def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: s
     """
     Set a value by its path, such as ``"sensor.bits"``, in place.
 
-    It replaces alternatives: a pixel pitch of the scene replaces its ``fit`` and field of view.
+    It replaces alternatives: a pixel pitch of the scene replaces its ``fit`` and field of view, a system gain of the sensor
+    its capacitance.
 
     Raises
     ------
@@ -763,10 +824,11 @@ def put_setting(source: Source | str | Path | None, data: dict[str, Any], key: s
         if i < len(names) - 1:
             section = section[step]
     section[step] = value
-    if names[:-1] == ["scene"] and step in FRAMINGS and value is not None:
-        for name in FRAMINGS:
-            if name != step:
-                section.pop(name, None)
+    for group in REPLACED.get(".".join(names[:-1]), ()):
+        if step in group and value is not None:
+            for name in group:
+                if name != step:
+                    section.pop(name, None)
 
 
 def resolve_files(directory: Path, value: Any, key: str = "", found: list[Path] | None = None) -> Any:

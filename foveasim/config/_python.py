@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from foveasim.config._models import FILE_OPTIONS, PerArea, call_of, models
-from foveasim.config._objects import FILE_SETTINGS, resolve_files
+from foveasim.config._objects import ELECTRONICS, FILE_SETTINGS, resolve_files
 from foveasim.config._problems import plain_settings, validate
 from foveasim.config._sources import Source
 from foveasim.layout import LAYOUTS, Layout
@@ -108,14 +108,18 @@ def _shot_lines(writer: _Writer, shot: Any) -> list[str]:
         camera["distortion"] = _Name("distortion")
     if shot.integration_order is not None:
         camera["order"] = shot.integration_order
-    sensor = {"layout": _Name("layout"), **writer.arguments(shot.sensor)}
+    sensor, make = {"layout": _Name("layout"), **writer.arguments(shot.sensor)}, "fs.Sensor"
+    for name in ELECTRONICS:
+        if (origin := sensor.pop(name, None)) is not None:
+            sensor = {"layout": sensor.pop("layout"), "origin": origin, **sensor}
+            make = f"fs.Sensor.from_{name}"
     capture = {"scene": _Name("scene"), "exposure_s": shot.exposure_s, "seed": shot.seed}
     for name in ("gaze_um", "axis"):
         if getattr(shot, name) != type(shot).model_fields[name].default:
             camera[name] = getattr(shot, name)
     return [
         *lines,
-        f"sensor = {writer.call('fs.Sensor', sensor)}",
+        f"sensor = {writer.call(make, sensor, positional=() if make == 'fs.Sensor' else ('layout', 'origin'))}",
         f"camera = {writer.call('fs.Camera', camera)}",
         writer.assignment("scene", shot.scene),
         f"capture = {writer.call('camera.capture', capture, positional=('scene',))}",

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Limits, OwnCheck, Usual, check_declared
 from foveasim._core.names import CHANNEL_LETTERS, find_wrong_letter, possible_names
-from foveasim._core.provenance import large_arrays
+from foveasim._core.provenance import copy_plain_data, large_arrays
 from foveasim._core.random_streams import Streams
 from foveasim._core.show import view_method
 from foveasim._core.threads import cached_property
@@ -52,12 +52,21 @@ from foveasim.sensor.effects import Collection, Effect, Photosites, Sites, Stage
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.dark import ACTIVATION, DOUBLING, DarkLaw, DarkSignal, HotSites, dark_current_factor
-from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
+from foveasim.sensor.effects.fixed_pattern import (
+    ColumnOffset,
+    DarkOffset,
+    DeadSites,
+    PhotoResponse,
+    PixelGain,
+    PixelOffset,
+)
 from foveasim.sensor.effects.readout import ReadNoise, ResetNoise, TelegraphNoise
 from foveasim.sensor.effects.shot import GAUSSIAN_ABOVE, ShotChoice, ShotNoise
 from foveasim.sensor.limits import (
+    ALTERNATIVES,
     CHARGE,
     EXPOSURE,
+    GAIN,
     NOISE,
     OFFSET,
     RATE,
@@ -77,10 +86,10 @@ from foveasim.sensor.model.prediction import (
 from foveasim.sensor.model.records import Record, light_records, map_light, readout_model
 from foveasim.sensor.pixel_optics import PixelOptics
 from foveasim.sensor.published.datasheet import DataSheet, read_datasheet
-from foveasim.sensor.published.presets import find_preset
+from foveasim.sensor.published.presets import find_preset, with_changes
 from foveasim.sensor.spectral.curves import ConstantCurve, Curve, CurveError
 from foveasim.sensor.spectral.response import FilterSet, rgb_filters
-from foveasim.units import electrons_to_volts, photon_energy_j
+from foveasim.units import ELEMENTARY_CHARGE_C, electrons_to_volts, photon_energy_j
 
 if TYPE_CHECKING:
     from foveasim.sensor.calibration import Calibration
@@ -128,8 +137,9 @@ class Sensor:
         Parameters of the three laws: temperature rise that doubles the dark current, K; activation energy, eV; fraction of the
         diffusion current at ``dark_reference_k``.
     dsnu_fraction : float
-        Dark-signal non-uniformity (DSNU): standard deviation over mean of the dark current. The distribution is log-normal
-        with mean ``dark_e_per_s``, so that values are never negative.
+        Non-uniformity of the dark current: its standard deviation over its mean. The distribution is log-normal with mean
+        ``dark_e_per_s``, so that values are never negative. It is not the DSNU of data sheets, which is ``dsnu_e``: with a
+        dark current of 1 e-/s and 0.01 s, dark frames differ by 0.001 e- for 0.1.
     hot_fraction, hot_e_per_s : float
         Fraction of hot sites, and their additional dark current (e-/s, at ``dark_reference_k``).
     dead_fraction : float
@@ -156,9 +166,15 @@ class Sensor:
         Standard deviation of the Gaussian read noise.
     rts_fraction, rts_e : float
         Random telegraph (RTS) noise: fraction of affected sites, and difference between their two states, e-.
+    dsnu_e : float, e-
+        Dark-signal non-uniformity (DSNU) of EMVA 1288: standard deviation over the sites of dark frames, for any exposure time.
+        A fixed Gaussian offset, which correlated double sampling does not remove; instead of ``pixel_fpn_fraction``.
     capacitance_f : float or (n_site,), F, optional
         Capacitance of the sense node; by default 1.5e-16 F per µm² of the area of a site, so that all sites saturate at equal
         irradiances: at 2,809 e-/µm² for 3 V. The paper's foveal run has 1e-13 F for all sites.
+    gain_dn_per_e : float or (n_site,), DN/e-, optional
+        System gain K of EMVA 1288, instead of ``capacitance_f``: the capacitance is ``2**bits q / (K v_sat_v)``. With
+        companding, K is the mean from 0 to V_sat.
     gain_fpn_fraction : float
         Gain FPN: standard deviation over mean of the conversion gain, a Gaussian distribution.
     nonlinearity_fraction : float
@@ -179,6 +195,9 @@ class Sensor:
         the noise budget and all weights that depend on noise. A collection replaces the shot noise.
     disabled : sequence of str
         Names of effects to switch off, including those of keywords. Draws of the other effects do not change.
+    provenance : mapping, optional
+        Where the values come from, as plain data; empty by default. Of data sheets and presets: title, source, printed and
+        derived quantities, assumptions, and the names of replaced parameters. It has no effect on results.
 
     Raises
     ------
@@ -227,9 +246,11 @@ class Sensor:
     read_noise_e: Annotated[PerSite, NOISE, Usual(0.0, 50.0)] = 0.0
     rts_fraction: Annotated[float, SHARE, Usual(0.0, 0.1)] = 0.0
     rts_e: Annotated[float, NOISE] = 0.0
+    dsnu_e: Annotated[float, NOISE, Usual(0.0, 50.0)] = 0.0
     capacitance_f: Annotated[
         PerSite | None, Limits(above=0.0, low=1e-18, at_most=1e-6, hint="capacitances are in farad: 1 fF is 1e-15")
     ] = None
+    gain_dn_per_e: Annotated[PerSite | None, GAIN] = None
     gain_fpn_fraction: Annotated[float, SPREAD] = 0.0
     nonlinearity_fraction: Annotated[
         float, Limits(low=-0.5, at_most=0.5, hint="above 0.5 the voltage would decrease with charge"), Usual(0.0, 0.1)
@@ -247,6 +268,7 @@ class Sensor:
     device_seed: Annotated[int, NOT_NEGATIVE] = 0
     effects: Sequence[Effect] = ()
     disabled: Iterable[str] = ()
+    provenance: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if not all(hasattr(self.layout, name) for name in ("n_sites", "channel", "columns")):
@@ -256,6 +278,9 @@ class Sensor:
             object.__setattr__(self, "qe", tuple(self.qe))
         elif not callable(self.qe):
             object.__setattr__(self, "qe", FRACTION.check("qe", self.qe))
+        for first, second in ALTERNATIVES:
+            if np.any(getattr(self, first)) and np.any(getattr(self, second)):
+                raise ParameterError(second, f"must not be given together with '{first}': they specify one quantity")
         if self.pedestal_v >= self.v_sat_v:
             raise ParameterError(
                 "pedestal_v",
@@ -273,6 +298,7 @@ class Sensor:
                 "e-/s",
                 "check dark_reference_k and the parameters of dark_law",
             )
+        object.__setattr__(self, "provenance", MappingProxyType(copy_plain_data(dict(self.provenance or {}))))
         object.__setattr__(self, "effects", check_effects(self.effects))
         if self._own_collection is not None and (self.shot_noise, self.gaussian_above_e) != ("auto", 100.0):
             raise ParameterError(
@@ -338,14 +364,13 @@ class Sensor:
         >>> sensor = fs.Sensor.from_preset(
         ...     fs.layout.grid(n_x=4, n_y=3, pitch_um=3.45), "machine_vision"
         ... )
-        >>> (
-        ...     sensor.bits,
-        ...     round(float(sensor.capacitance_f[0] / 1.602176634e-19)),
-        ... )  # full well capacity at 1 V
-        (12, 10700)
+        >>> sensor.bits, sensor.provenance["printed"]["full_well_e"]
+        (12, '10700')
         """
         ideal = cls(layout)  # checks the layout
-        return cls(layout, **(find_preset(preset).values(ideal.layout.area_um2) | parameters))
+        has_lines = "readout_line" in ideal.layout.columns
+        values = find_preset(preset).values(ideal.layout.area_um2, has_lines=has_lines)
+        return cls(layout, **with_changes(values, parameters))
 
     @classmethod
     def from_datasheet(
@@ -383,14 +408,15 @@ class Sensor:
         ... )
         >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.25)
         >>> sensor = fs.Sensor.from_datasheet(layout, sheet)
-        >>> sensor.bits, sensor.read_noise_e, sensor.pedestal_v * 4096
-        (12, 5.56, 240.0)
+        >>> sensor.bits, sensor.read_noise_e, sensor.provenance["derived"]["threshold_e"]
+        (12, 5.56, 'dark_noise_e, quantisation and 1/2')
         """
         if not isinstance(sheet, DataSheet | str | Path):
             raise ParameterError("sheet", f"must be a DataSheet, or the path of one, got {type_name(sheet)}")
         found = sheet if isinstance(sheet, DataSheet) else read_datasheet(sheet)
         ideal = cls(layout)  # checks the layout
-        return cls(layout, **(found.parameters(ideal.layout.area_um2) | parameters))
+        has_lines = "readout_line" in ideal.layout.columns
+        return cls(layout, **with_changes(found.parameters(ideal.layout.area_um2, has_lines=has_lines), parameters))
 
     @classmethod
     def from_settings(
@@ -563,6 +589,8 @@ class Sensor:
             yield ReadNoise(self.read_noise_e)
         if self.rts_fraction and self.rts_e:
             yield TelegraphNoise(self.rts_fraction, self.rts_e)
+        if self.dsnu_e:
+            yield DarkOffset(self.dsnu_e)
         if self.gain_fpn_fraction:
             yield PixelGain(self.gain_fpn_fraction)
         if self.pixel_fpn_fraction and not self.cds:
@@ -636,9 +664,16 @@ class Sensor:
     @cached_property
     def sites(self) -> Sites:
         """Photosites with device and sense-node capacitances, for effects."""
-        given_f = None if self.capacitance_f is None else np.atleast_1d(np.array(self.capacitance_f, np.float64))
-        return Sites(
-            self.layout, self.device, None if given_f is None else read_only(given_f), _complete=self._complete_sites
+        return Sites(self.layout, self.device, self._given_f, _complete=self._complete_sites)
+
+    @property
+    def _given_f(self) -> Floats | None:
+        """Capacitances of the sense nodes, (n_site,) or (1,) F; None for those by area."""
+        if self.gain_dn_per_e is not None:
+            gain = np.atleast_1d(np.asarray(self.gain_dn_per_e, np.float64))
+            return read_only(self.adc.n_codes * ELEMENTARY_CHARGE_C / (gain * self.v_sat_v))
+        return (
+            None if self.capacitance_f is None else read_only(np.atleast_1d(np.array(self.capacitance_f, np.float64)))
         )
 
     @property

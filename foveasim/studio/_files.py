@@ -22,8 +22,7 @@ from foveasim.config import (
     read_settings,
     resolve_files,
 )
-from foveasim.config._models import expand_preset
-from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS
+from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS, with_electronics
 from foveasim.errors import FileError, ParameterError, SimulationError, printable
 from foveasim.scene import Scene
 from foveasim.studio._messages.models import ApplyPreset, FitScene, RestoreSettings, handles
@@ -47,15 +46,26 @@ def start_settings(shot: str | Path | None, changes: Sequence[str] = ()) -> tupl
     """
     path = demo_settings()[0] if shot is None else Path(shot)
     settings = read_settings(path, changes)
-    settings = with_preset(settings)
+    settings = with_values(settings, path)
     if isinstance(settings.get("layout"), str):
         settings["layout"] = _inlined(settings["layout"], path.parent)
     return resolve_files(path.parent.absolute(), settings), path.stem
 
 
+def with_values(settings: dict[str, Any], path: str | Path) -> dict[str, Any]:
+    """
+    Return settings of a file with the values of the sensor's preset or data sheet.
+
+    The controls show these. Raises ConfigError when the data sheet is invalid.
+    """
+    return {**settings, "sensor": with_electronics(path, settings["sensor"])} if "sensor" in settings else settings
+
+
 def with_preset(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return settings with the values of the sensor's preset, which the controls show."""
-    return {**settings, "sensor": expand_preset(settings["sensor"])} if "sensor" in settings else settings
+    """Return settings with the values of the sensor's preset; a data sheet is not read."""
+    sensor = settings.get("sensor")
+    has_sheet = isinstance(sensor, Mapping) and sensor.get("datasheet") is not None
+    return settings if has_sheet or sensor is None else {**settings, "sensor": with_electronics(None, sensor)}
 
 
 def preset_paths() -> dict[str, Path]:
@@ -226,7 +236,9 @@ class Files:
         Raises FileError when the file is not available, or not valid YAML.
         """
         self.available(path)
-        return resolve_files(Path(path).parent, with_preset(read_settings(path)))
+        settings: dict[str, Any] = resolve_files(Path(path).parent, read_settings(path))
+        self.check(settings.get("sensor"), "sensor")  # before its data sheet is read
+        return with_values(settings, path)
 
     def layout_of(self, path: str) -> Any:
         """

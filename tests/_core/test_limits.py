@@ -135,7 +135,7 @@ def arguments_of(kind, **given):
 def test_most_parameters_declare_limits():
     assert len(CLASSES) > 20
     assert len(NUMBERS) > 100
-    assert len(CLASSES[fs.Sensor]) == 30
+    assert len(CLASSES[fs.Sensor]) == 32
 
 
 @pytest.mark.parametrize(("kind", "name", "declared"), **BY_NAME)

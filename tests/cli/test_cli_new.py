@@ -164,3 +164,39 @@ def test_starting_file_errors_are_one_line(foveasim, tmp_path, arguments, line):
 
     assert (result.returncode, result.stdout, result.stderr) == (2, "", line)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_new_sensor_is_run(foveasim, tmp_path):
+    quantities = ["pixel_um=2.25", "bits=12", "qe_percent=91.25", "dark_noise_e=5.560", "saturation_e=9458"]
+    options = [option for each in quantities for option in ("--set", each)]
+    result = foveasim("new", "sensor", "--from-datasheet", *options, "--out", "imx900.yaml", cwd=tmp_path)
+
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout == ("wrote imx900_datasheet.yaml and imx900.yaml; next: foveasim run imx900.yaml --out out\n")
+    shot = read_shot(tmp_path / "imx900.yaml", SMALL)
+    assert shot.camera.sensor.read_noise_e == 5.56
+    assert shot.camera.capture(shot.scene, exposure_s=0.001, seed=0).saturated_fraction < 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (
+            ("sensor",),
+            "error: --from-datasheet and the kind sensor belong together: foveasim new sensor --from-datasheet\n",
+        ),
+        (
+            ("sensor", "--from-datasheet"),
+            "error: the quantities of the data sheet must be given as --set NAME=VALUE, or be typed in a terminal\n",
+        ),
+        (
+            ("sensor", "--from-datasheet", "--set", "bits=12"),
+            "error: 'pixel_um' must be in the data sheet\n",
+        ),
+    ],
+)
+def test_new_sensor_errors_are_one_line(foveasim, tmp_path, arguments, line):
+    result = foveasim("new", *arguments, cwd=tmp_path)
+
+    assert (result.returncode, result.stdout, result.stderr) == (2, "", line)
+    assert list(tmp_path.iterdir()) == []

@@ -709,12 +709,11 @@ def test_presets_of_files_equal_those_of_python():
 
 
 def test_unknown_preset_lists_those_that_exist():
-    with pytest.raises(ConfigError, match=r"sensor\.preset: must be one of 'mobile', 'machine_vision', 'scientific'"):
-        build_shot(None, preset_settings(preset="webcam"))
+    with pytest.raises(ConfigError, match=r"sensor\.preset: must be one of 'mobile', .* got \"machine\"; did you mean"):
+        build_shot(None, preset_settings(preset="machine"))
 
 
 def test_preset_in_python_has_its_values():
     source = to_python(preset_settings(preset="mobile"))
 
-    assert "capacitance_f=3.5" in source
-    assert "preset" not in source
+    assert 'fs.Sensor.from_preset(layout, "mobile")' in source

@@ -437,6 +437,10 @@ CALLS = {
     "config.validate": lambda o: config.validate(None, fs.DesignRules, {"min_size_um": 1.0}),
     "config.write_3d_picture": lambda o: config.write_3d_picture(o.result, o.directory),
     "config.write_results": lambda o: config.write_results(o.shot, o.result.capture, o.directory / "results"),
+    "config.write_sensor_files": lambda o: config.write_sensor_files(
+        {"pixel_um": "3.45", "bits": 12, "qe_percent": 64, "dark_noise_e": "2.1", "saturation_e": 10_400},
+        o.path(".yaml"),
+    ),
     "config.write_starting_file": lambda o: config.write_starting_file("study", o.path(".yaml")),
     "distortion.distort_map": lambda o: distortion.distort_map(o.power_map, o.lens),
     "distortion.from_opencv": lambda o: distortion.from_opencv(

@@ -94,6 +94,7 @@ CAMERAS = {
     "pixel optics": {"pixel_optics": fs.sensor.Microlens(height_um=8.0, refractive_index=1.5, crosstalk=True)},
     "mixing": {"crosstalk": Diffusion(spread_um=0.8), "coupling": InterPixelCapacitance(neighbour_fraction=0.02)},
     "dark": {"dark_e_per_s": 400.0, "dsnu_fraction": 0.3, "prnu_fraction": 0.05, "dead_fraction": 0.05},
+    "data sheet": {"capacitance_f": None, "gain_dn_per_e": 0.2, "dsnu_e": 4.0, "pedestal_v": 0.1},
     "converter": {"dnl_dn": 0.4, "companding": "root", "nonlinearity_fraction": 0.04},
 }
 

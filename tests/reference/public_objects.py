@@ -129,7 +129,7 @@ def public_objects(directory):
         sensor.SplineCurve(wavelength_nm=TABLE, value=CURVE.value), sensor.StepCurve(edge_nm=TABLE, value=(0.5,) * 199), CURVE,
         sensor.DataSheet(pixel_um=3.45, bits=12, qe_percent=64, dark_noise_e=2.1, saturation_e=10_400),
         sensor.Calibration(**dict.fromkeys(("offset_dn", "gain", "read_noise_dn", "expected_dn"), MANY), **dict.fromkeys(("hot", "dead", "noisy", "clipped"), MANY < 0.0)),
-        effects.ColumnOffset(0.1), effects.DarkSignal(0.1), effects.DeadSites(0.1), effects.HotSites(0.1, 10.0), effects.PhotoResponse(0.1),
+        effects.ColumnOffset(0.1), effects.DarkOffset(2.0), effects.DarkSignal(0.1), effects.DeadSites(0.1), effects.HotSites(0.1, 10.0), effects.PhotoResponse(0.1),
         effects.PixelGain(0.1), effects.PixelOffset(0.1), effects.ReadNoise(MANY), effects.ResetNoise(300.0), effects.ShotNoise(), SENSOR.sites,
         effects.StepModel(MANY, MANY, MANY), effects.TelegraphNoise(0.1, 2.0), effects.ResponseMap(MANY), effects.OffsetMap(MANY),
         effects.TelegraphMap(MANY), effects.RowNoise(2.0), effects.ColumnNoise(2.0),

@@ -16,6 +16,7 @@ from foveasim import Sensor
 from foveasim.layout import grid
 from foveasim.sensor import Diffusion, InterPixelCapacitance, effects
 from foveasim.sensor.effects import FixedFactor
+from foveasim.sensor.limits import ALTERNATIVES
 
 #: Levels of five rows of blocks, e-; a range of 4,000 e- with a pedestal of an eighth.
 LEVELS_E, FULL_E, PEDESTAL = (3.0, 60.0, 400.0, 1500.0, 3000.0), 4000.0, 0.125
@@ -61,7 +62,8 @@ def merge(names):
         merged["effects"] = [*merged["effects"], *own.pop("effects", [])]
         merged |= own
     n_collections = sum(effect.stage == "collection" for effect in merged["effects"])
-    return None if n_collections + ("shot_noise" in merged) > 1 else merged
+    is_twice = any(merged.keys() >= {*pair} for pair in ALTERNATIVES)
+    return None if is_twice or n_collections + ("shot_noise" in merged) > 1 else merged
 
 
 @cache

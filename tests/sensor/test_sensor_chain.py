@@ -777,6 +777,8 @@ def test_sensitivity_affects_only_photoelectrons():
         ("dark_doubling_k", 1e-6, r"'dark_doubling_k' must be from 0.1 to 1000, got 1e-06 K"),
         ("dnl_dn", 1e300, "'dnl_dn' must be <= 65536, got .* DN"),
         ("inl_dn", [0.0, 1e300], "'inl_dn' must be from -65536 to 65536 everywhere, got .* DN"),
+        ("gain_dn_per_e", 0.0, "'gain_dn_per_e' must be > 0"),
+        ("dsnu_e", -1.0, "'dsnu_e' must be >= 0"),
         ("capacitance_f", 1.0, "'capacitance_f' must be from 1e-18 to 1e-06, got 1.0 F; capacitances are in farad"),
     ],
 )

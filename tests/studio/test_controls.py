@@ -43,8 +43,9 @@ def complete(choice):
 
 
 def keys_of(definition):
-    root = schema()
-    return set(root["$defs"][definition]["properties"])
+    """Return the parameters of a section that users change."""
+    properties = schema()["$defs"][definition]["properties"]
+    return {name for name, below in properties.items() if not below.get("readOnly")}
 
 
 @pytest.mark.slow(keep=3)

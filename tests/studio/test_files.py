@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import yaml
 
 import foveasim as fs
 from foveasim.errors import FileError
@@ -145,3 +146,33 @@ def test_equal_files_are_stored_once(recorder):
     assert recorder.session.add_file("listing.txt", b"1 2 3") == first
     assert recorder.session.n_free_bytes == free
     assert recorder.session.add_file("listing.txt", b"1 2 4") != first
+
+
+def test_data_sheets_of_settings_are_checked(recorder, tmp_path):
+    """The sheet is read after the check of its path, and the controls show its values."""
+    uploads = recorder.session.files._uploads
+    sheet = {"pixel_um": "3.45", "bits": 12, "qe_percent": 64, "dark_noise_e": "2.1", "saturation_e": 10_400}
+    for directory in (uploads, tmp_path):
+        (directory / "camera.yaml").write_text(yaml.safe_dump(sheet))
+    settings = uploads / "shot.yaml"
+    start = recorder.session.history.settings
+    settings.write_text(yaml.safe_dump({**start, "sensor": {"datasheet": "camera.yaml", "bits": 10}}))
+    found = recorder.session.files.settings_of(str(settings))["sensor"]
+
+    assert (found["bits"], found["read_noise_e"], "datasheet" in found) == (10, 2.1, False)
+    assert found["provenance"]["replaced"] == ["bits"]
+    settings.write_text(yaml.safe_dump({**start, "sensor": {"datasheet": str(tmp_path / "camera.yaml")}}))
+    with pytest.raises(FileError, match=r"sensor\.datasheet: .* is not available here"):
+        recorder.session.files.settings_of(str(settings))
+
+
+def test_chosen_data_sheet_replaces_electronics(recorder):
+    path = recorder.session.files._uploads / "camera.yaml"
+    sheet = {"pixel_um": "3.45", "bits": 11, "qe_percent": 64, "dark_noise_e": "2.1", "saturation_e": 10_400}
+    path.write_text(yaml.safe_dump(sheet))
+    recorder.do(do="set", key="sensor.bits", value=14, final=True)
+    state = recorder.do(do="set", key="sensor.datasheet", value=str(path), final=True)
+
+    assert state["errors"] == {}
+    assert "bits" not in state["settings"]["sensor"]
+    assert recorder.session.result.capture.bits == 11

@@ -237,6 +237,7 @@ def test_deep_values_are_rejected(recorder, settings):
         ("layout.parameters", {"density": "/etc/passwd"}),
         ("sensor.qe", {"kind": "file", "path": "/etc/passwd"}),
         ("sensor.filters", {"path": "/proc/self/environ"}),
+        ("sensor.datasheet", "/etc/passwd"),
         ("optics.pupil", [{"kind": "image", "picture": "/etc/passwd"}]),
     ],
 )  # fmt: skip
@@ -394,7 +395,19 @@ def test_electronics_are_replaced_by_a_preset(recorder):
         assert sensor["bits"] == bits
         assert {key: sensor[key] for key in PRESETS[name].settings()} == PRESETS[name].settings()
         assert sensor["filters"] == "rgb"
-    assert "cds" not in sensor  # of the preset before
+    assert "pedestal_v" not in sensor  # of the preset before
+
+
+def test_quantum_efficiency_remains_without_another(recorder):
+    """That of a preset without one; the data sheet of the IMX273 has 64 %."""
+    qe = {"kind": "silicon", "depth_um": 4.0}
+    recorder.do(do="set", key="sensor.qe", value=qe, final=True)
+    found = [
+        recorder.do(do="set", key="sensor.preset", value=name, final=True)["settings"]["sensor"]["qe"]
+        for name in ("mobile", "imx273")
+    ]
+
+    assert found == [qe, 0.64]
 
 
 def test_restored_settings_give_same_codes(recorder, make_session):

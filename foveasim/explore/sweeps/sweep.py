@@ -186,7 +186,7 @@ def run_sweep(
     ... )
     >>> results = fs.explore.run_sweep(plan, workers=0)  # in this process
     >>> results["snr_mean"].round().values.tolist()
-    [46.0, 33.0, 24.0]
+    [46.0, 33.0, 23.0]
     """
     import_xarray("sweep")  # before hours of work
     if out is None:

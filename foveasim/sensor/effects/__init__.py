@@ -36,7 +36,14 @@ from foveasim.sensor.effects.crosstalk import (
     Mixing,
 )
 from foveasim.sensor.effects.dark import DarkLaw, DarkSignal, HotSites, dark_current_factor
-from foveasim.sensor.effects.fixed_pattern import ColumnOffset, DeadSites, PhotoResponse, PixelGain, PixelOffset
+from foveasim.sensor.effects.fixed_pattern import (
+    ColumnOffset,
+    DarkOffset,
+    DeadSites,
+    PhotoResponse,
+    PixelGain,
+    PixelOffset,
+)
 from foveasim.sensor.effects.measured import ColumnNoise, OffsetMap, ResponseMap, RowNoise, TelegraphMap
 from foveasim.sensor.effects.readout import ReadNoise, ResetNoise, TelegraphNoise
 from foveasim.sensor.effects.shot import ShotNoise, draw_shot_noise
@@ -51,6 +58,7 @@ __all__ = [
     "ColumnOffset",
     "CrosstalkOperator",
     "DarkLaw",
+    "DarkOffset",
     "DarkSignal",
     "DeadSites",
     "Diffusion",
@@ -91,6 +99,7 @@ STANDARD: tuple[Any, ...] = (
     ResetNoise,
     ReadNoise,
     TelegraphNoise,
+    DarkOffset,
     PixelGain,
     PixelOffset,
     ColumnOffset,

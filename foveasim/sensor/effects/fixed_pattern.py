@@ -12,7 +12,7 @@ from foveasim._core.calls import FRACTION, NOT_NEGATIVE, Declared
 from foveasim._core.validation import Floats
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset, Sites, Stage
 
-__all__ = ["ColumnOffset", "DeadSites", "PhotoResponse", "PixelGain", "PixelOffset"]
+__all__ = ["ColumnOffset", "DarkOffset", "DeadSites", "PhotoResponse", "PixelGain", "PixelOffset"]
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,33 @@ class DeadSites(Declared, FixedFactor):
     def pattern_moments(self, sites: Sites) -> tuple[float, float]:
         """Return the moments of a Bernoulli distribution."""
         return 1.0 - self.fraction, self.fraction * (1.0 - self.fraction)
+
+
+@dataclass(frozen=True)
+class DarkOffset(Declared, FixedOffset):
+    """
+    DSNU of EMVA 1288: Gaussian offsets, which correlated double sampling does not remove.
+
+    Parameters
+    ----------
+    dsnu_e : float, e-
+        Standard deviation.
+    """
+
+    example: ClassVar[Mapping[str, Any]] = {"dsnu_e": 50.0}
+    name: ClassVar[str] = "dark_offset"
+    stage: ClassVar[Stage] = "charge"
+    needs_layout: ClassVar[bool] = False
+
+    dsnu_e: Annotated[float, NOT_NEGATIVE]
+
+    def pattern(self, sites: Sites) -> Floats:
+        """Return the offsets, (n,) e-."""
+        return self.dsnu_e * sites.device.normals(self.name)
+
+    def pattern_moments(self, sites: Sites) -> tuple[float, float]:
+        """Return 0 and the square of ``dsnu_e``."""
+        return 0.0, self.dsnu_e**2
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foveasim.config import get_setting, put_setting
-from foveasim.config._models import expand_preset
+from foveasim.config._objects import ELECTRONICS, with_electronics
 from foveasim.errors import FileError
 from foveasim.layout import LAYOUTS
 from foveasim.sensor import PRESETS
+from foveasim.sensor.limits import ALTERNATIVES
+from foveasim.sensor.published.datasheet import PARAMETERS
 from foveasim.studio._files import with_layout
 from foveasim.studio._messages.models import DeleteValue, OpenFile, ResetValue, handles
 from foveasim.studio._settings.controls import controls_of
@@ -23,6 +25,8 @@ from foveasim.studio._settings.uses import PLACES, use_of
 if TYPE_CHECKING:
     from foveasim.studio._session import Session
 
+#: Parameters of the electronics, which a preset or data sheet replaces.
+ELECTRONIC = PARAMETERS.union(*ALTERNATIVES, *(preset.parameters for preset in PRESETS.values()))
 #: Filters that a layout receives: a mosaic, or a colouring of the sites.
 MOSAIC = ["RG", "GB"]
 COLOURING = {"kind": "graph_colouring", "n_channels": 3}
@@ -94,12 +98,20 @@ def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:
             del layout["edits"]
 
 
-def choose_preset(settings: dict[str, Any]) -> None:
-    """Replace the electronics of the sensor by those of its preset, without earlier values."""
+def choose_electronics(settings: dict[str, Any]) -> None:
+    """
+    Replace the electronics by those of the preset or data sheet, without earlier values.
+
+    A data sheet is read with the other files of the settings, which are checked before. A quantum efficiency remains with a
+    preset that has none.
+    """
     sensor = settings.get("sensor")
-    if isinstance(sensor, dict) and sensor.get("preset") is not None:
-        names = {name for preset in PRESETS.values() for name in preset.settings()}
-        settings["sensor"] = expand_preset({key: value for key, value in sensor.items() if key not in names})
+    if isinstance(sensor, dict) and any(sensor.get(name) is not None for name in ELECTRONICS):
+        others = {key: value for key, value in sensor.items() if key not in ELECTRONIC}
+        if others.get("datasheet") is None:
+            earlier = {name: value for name, value in sensor.items() if name == "qe"}
+            others = {**earlier, **with_electronics(None, others)}
+        settings["sensor"] = others
 
 
 def with_picture(settings: Mapping[str, Any], start: Mapping[str, Any], path: str) -> dict[str, Any]:

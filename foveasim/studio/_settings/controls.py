@@ -238,7 +238,7 @@ def _parameters(
     values = value if isinstance(value, Mapping) else {}
     required = selected.get("required", ())
     for inner, below in selected["properties"].items():
-        if inner in TAGS and ("const" in below or len(below.get("enum", ())) == 1):
+        if below.get("readOnly") or (inner in TAGS and ("const" in below or len(below.get("enum", ())) == 1)):
             continue
         yield from _controls(
             root,

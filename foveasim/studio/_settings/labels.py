@@ -25,7 +25,7 @@ WORDS: dict[str, Words] = {
         synonyms="adc resolution bit depth quantisation dynamic range",
     ),
     "by_um": Words("displacement", "Displacement of the sites along x and y."),
-    "capacitance_f": Words("sense-node capacitance", synonyms="gain,conversion gain,system gain,full well"),
+    "capacitance_f": Words("sense-node capacitance", synonyms="gain,conversion gain,full well"),
     "cds": Words("correlated double sampling", synonyms="cds reset noise"),
     "coma_um": Words(help="Path difference of the coma at the edge of the aperture and of the field."),
     "companding": Words(
@@ -55,7 +55,13 @@ WORDS: dict[str, Words] = {
     "disabled": Words("disabled effects", synonyms="switch off without noise"),
     "distance_m": Words("scene distance", synonyms="object working"),
     "dnl_dn": Words("DNL", "Differential nonlinearity of the ADC: standard deviation of the code transitions."),
-    "dsnu_fraction": Words("DSNU", synonyms="fixed pattern"),
+    "datasheet": Words(
+        "data sheet", "File of a data sheet, whose values replace those of the sensor.", synonyms="emva electronics"
+    ),
+    "dsnu_e": Words(
+        "DSNU", "Standard deviation of dark frames over the sites, as in data sheets.", synonyms="fixed pattern emva"
+    ),
+    "dsnu_fraction": Words("non-uniformity of dark current", synonyms="fixed pattern,dsnu"),
     "dx_um": Words("displacement along x", "Displacement of all sites along x."),
     "dy_um": Words("displacement along y", "Displacement of all sites along y."),
     "emission": Words(synonyms="relative illumination cos4 vignetting falloff"),
@@ -79,6 +85,9 @@ WORDS: dict[str, Words] = {
     "from_um": Words("moved vertices"),
     "full_well_e": Words("full well", synonyms="saturation capacity dynamic range"),
     "fwhm_nm": Words("full width at half maximum", "Full width of the curve at half of its maximum."),
+    "gain_dn_per_e": Words(
+        "system gain", "System gain K of the ADC, instead of a capacitance.", synonyms="gain,conversion gain,emva"
+    ),
     "gain_fpn_fraction": Words("gain FPN", synonyms="fixed pattern"),
     "gaussian_above_e": Words("exact shot noise up to", synonyms="poisson"),
     "gaze_path": Words(

@@ -12,7 +12,7 @@ from foveasim.layout import Layout
 from foveasim.studio._engine import Simulated
 from foveasim.studio._files import apply_preset
 from foveasim.studio._messages.models import AssignValues, SetValue, handles
-from foveasim.studio._settings.changes import choose_preset
+from foveasim.studio._settings.changes import choose_electronics
 from foveasim.studio._settings.controls import chosen_value
 from foveasim.studio._settings.unknowns import balanced, solved_of
 
@@ -46,8 +46,8 @@ def with_values(
         else:
             put_setting(None, settings, key, chosen_value(key, copy.deepcopy(value), controls, settings, start))
         settings = balanced(settings, key, before, layout_of)
-        if key == "sensor.preset":
-            choose_preset(settings)
+        if key in ("sensor.preset", "sensor.datasheet"):
+            choose_electronics(settings)
     return settings
 
 

@@ -49,7 +49,7 @@ def contents_of(files: Files) -> dict[str, Any]:
         "electronics": [
             {
                 "name": name,
-                "label": PRESETS[name].title,
+                "label": f"{PRESETS[name].group}: {PRESETS[name].title}",
                 "source": PRESETS[name].source,
                 "scaling": PRESETS[name].scaling,
             }

@@ -17,7 +17,7 @@ from foveasim.sensor import PRESETS
 from foveasim.studio._engine import MAX_SITES
 from foveasim.studio._files import with_covering_scene, with_layout, without_gaze
 from foveasim.studio._messages.models import NewSensor, handles
-from foveasim.studio._settings.changes import choose_preset, match_filters
+from foveasim.studio._settings.changes import choose_electronics, match_filters
 from foveasim.studio._settings.templates import templates
 from foveasim.studio._settings.unknowns import generated_layout
 
@@ -43,8 +43,10 @@ def mosaics() -> list[str]:
 
 
 def electronics() -> list[str]:
-    """Return the named electronics that specify the range of the ADC."""
-    return [name for name, preset in PRESETS.items() if set(preset.settings()) >= RANGE]
+    """Return the named electronics that specify the range of the ADC, by group and title."""
+    found = [name for name, preset in PRESETS.items() if preset.quantities or {*preset.parameters} >= RANGE]
+    groups = list(dict.fromkeys(PRESETS[name].group for name in found))
+    return sorted(found, key=lambda name: (groups.index(PRESETS[name].group), PRESETS[name].title))
 
 
 @handles(NewSensor)
@@ -85,7 +87,7 @@ def new_sensor(session: Session, message: NewSensor) -> dict[str, Any]:
         **(found.get("sensor") or {}),
         "preset": check_choice("electronics", message.electronics, electronics()),
     }
-    choose_preset(found)
+    choose_electronics(found)
     found["sensor"].pop("filters", None)
     if mosaic is not None:
         found["sensor"]["filters"], found["layout"]["mosaic"] = FILTERS, mosaic

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from functools import singledispatch
 from typing import Any, cast
@@ -172,7 +172,17 @@ def _sensor_facts(sensor: Sensor) -> dict[str, object]:
         else "",
         "temperature": f"{sensor.temperature_k:g} K",
         "disabled": ", ".join(sensor.disabled),
+        **_origin(sensor.provenance or {}),
     }
+
+
+def _origin(provenance: Mapping[str, Any]) -> dict[str, object]:
+    """Return rows with the origin of values."""
+    titles = {"title": "published sensor", "source": "source", "assumptions": "assumptions", "replaced": "replaced"}
+    found = {titles[name]: value for name, value in provenance.items() if name in titles}
+    derived = [f"{name}: {how}" for name, how in dict(provenance.get("derived", {})).items()]
+    rows = {**found, "derived": derived}
+    return {name: "; ".join(map(str, value)) if isinstance(value, list) else value for name, value in rows.items()}
 
 
 def _effects_table(sensor: Sensor) -> Html:
