@@ -698,6 +698,59 @@ def events(
 
 
 @app.command()
+def twin(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder of stacks of raw frames: subfolders such as dark_10ms and flat_10ms, or a file stacks.yaml."
+        ),
+    ],
+    bits: Annotated[int, typer.Option("--bits", help="Bits of the codes.")],
+    pixel_um: Annotated[float, typer.Option("--pixel-um", help="Side of a pixel in µm.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Directory for twin.npz, report.html and figures.")] = Path(
+        "twin"
+    ),
+    mosaic: Annotated[
+        str | None, typer.Option("--mosaic", help="Colours of the first two rows: RGGB, BGGR, GRBG or GBRG.")
+    ] = None,
+    companding: Annotated[
+        str, typer.Option("--companding", help="Transfer function of the ADC: linear, root or log.")
+    ] = "linear",
+    log_strength: Annotated[float, typer.Option("--log-strength", help="Strength of logarithmic companding.")] = 100.0,
+) -> None:
+    """Estimate the sensor of a camera from its dark and flat frames."""
+    from foveasim._io.atomic import remove_directory
+    from foveasim._io.resumable import disk_errors, partial_path
+    from foveasim.twin import fit
+
+    sums = partial_path(out)
+    with _progress(folder.name, f"sums of finished stacks are stored in {sums}, {RESUME}") as progress:
+        found = fit(
+            folder,
+            bits=bits,
+            pixel_um=pixel_um,
+            mosaic=cast("Any", mosaic),
+            companding=cast("Any", companding),
+            log_strength=log_strength,
+            resume=sums,
+            progress=progress,
+        )
+    with disk_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    paths = [out / "twin.npz", out / "report.html"]
+    found.save(paths[0])
+    found.write(paths[1])
+    paths += found.write_figures(out)
+    remove_directory(sums)
+    table = _described("parameter")
+    for row in found.records():
+        value = row["note"] or f"{row['value']:.4g} ({row['low']:.4g} to {row['high']:.4g})"
+        table.add_row(row["parameter"], value)
+    console.print(table)
+    _report("wrote " + ", ".join(map(str, paths)))
+
+
+@app.command()
 def schema(
     kind: Annotated[str, typer.Argument(help=f"Kind of file: {KINDS}.")] = "shot",
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -13,20 +12,19 @@ from numpy.typing import NDArray
 from foveasim.compare.intervals import with_unit
 from foveasim.errors import printable
 from foveasim.metrics.registry import metric_info
+from foveasim.view.web._report_page import style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
-    from matplotlib.figure import Figure
 
     from foveasim.compare.comparison import Comparison
 
-__all__ = ["COLOURS", "draw_measure", "draw_sizes", "figure_of", "overview"]
+__all__ = ["COLOURS", "draw_measure", "draw_sizes", "overview"]
 
 #: Colours of the cameras, distinguishable with colour-vision deficiencies and on light and dark pages, and their markers.
 COLOURS = ("#2f7fd6", "#e0862a", "#1f9e77", "#c95fb0", "#8a8f2e", "#c8474b", "#7a68d8", "#4aa3b5")
 MARKERS = "osD^vP*X"
-FIGURE_INCHES = (4.7, 3.1)
 MAX_NAME = 28
 #: Entry of the bands in a legend.
 BAND = "95 % interval"
@@ -90,7 +88,7 @@ def overview(comparison: Comparison) -> NDArray[Any]:
         axes: NDArray[Any] = figure.subplots(n_rows, n_columns).ravel()
         for draw, one in zip(draws, axes[: len(draws)], strict=True):
             draw(one)
-            _style(one, "black", "0.9")
+            style_axes(one, "black", "0.9")
         for one in axes[len(draws) :]:
             one.set_visible(False)
         entries = {
@@ -102,20 +100,6 @@ def overview(comparison: Comparison) -> NDArray[Any]:
     return axes[: len(draws)]
 
 
-def figure_of(draw: Callable[[Axes], None], ink: str, faint: str) -> Figure:
-    """Return a figure of one of the functions above, in colours of its text and its grid."""
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context({"text.parse_math": False}):
-        figure = Figure(figsize=FIGURE_INCHES, layout="constrained")
-        axes = figure.add_subplot()
-        draw(axes)
-        _style(axes, ink, faint)
-        axes.legend(frameon=False, fontsize=9, labelcolor=ink)
-    return figure
-
-
 def _label_plainly(axis: Axis) -> None:
     """Label a logarithmic axis with plain numbers, without the markup of powers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -123,16 +107,6 @@ def _label_plainly(axis: Axis) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}" if value < 1e6 else f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
-
-
-def _style(axes: Axes, ink: str, faint: str) -> None:
-    axes.grid(color=faint, linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.tick_params(which="both", colors=ink)
-    for spine in axes.spines.values():
-        spine.set_color(ink)
-    for label in (axes.xaxis.label, axes.yaxis.label):
-        label.set_color(ink)
 
 
 def _line_of(comparison: Comparison, k: int) -> dict[str, Any]:

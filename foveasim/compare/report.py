@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.quantities import format_quantity
 from foveasim.compare.budgets import BUDGETS, budget_rows
-from foveasim.compare.figures import draw_measure, draw_sizes, figure_of
+from foveasim.compare.figures import draw_measure, draw_sizes
 from foveasim.compare.intervals import MIN_SCENES
 from foveasim.compare.metrics import best_cameras, metric_rows
 from foveasim.metrics.registry import metric_info
@@ -23,6 +23,7 @@ from foveasim.view.web._report_page import (
     ReportSection,
     ReportTable,
     drawn_figure,
+    figure_of,
     picture_figure,
     report_html,
 )

@@ -1,5 +1,7 @@
 """
-Real cameras and their simulation: from recorded frames or events to a sensor, and real pictures beside simulated ones.
+Real cameras and their simulation.
+
+From recorded frames or events to a sensor, and real pictures beside simulated ones.
 
 ::
 

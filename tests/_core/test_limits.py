@@ -59,6 +59,8 @@ EXAMPLES = {
     "log_contrast": [0.1, 0.2],
     "n_trials": [9, 9],
     "n_responses": [1, 8],
+    "frames": np.ones((2, 4, 4), np.uint16),
+    "exposure_s": 0.01,
 }
 #: Parameters that others require.
 COMPANIONS = {

@@ -264,6 +264,20 @@ class Objects:
         )
 
     @cached_property
+    def stacks(self):
+        """Folder of stacks of frames."""
+        folder, rng = self.path("", "frames"), np.random.default_rng(0)
+        for name, signal_e in (("dark_1ms", 0.0), ("flat_1ms", 1000.0), ("flat_2ms", 2000.0), ("flat_4ms", 4000.0)):
+            (folder / name).mkdir(parents=True)
+            codes = rng.poisson(signal_e, (8, 24, 32)) + rng.normal(60.0, 5.0, (8, 24, 32))
+            np.save(folder / name / "frames.npy", np.rint(0.5 * codes).astype(np.uint16))
+        return folder
+
+    @cached_property
+    def twin(self):
+        return fs.twin.fit(self.stacks, bits=12, pixel_um=3.0)
+
+    @cached_property
     def twins(self):
         camera = fs.Camera(optics=self.optics, sensor=fs.Sensor(fs.layout.grid(n_x=30, n_y=30, pitch_um=3.0)))
         return camera.compare_with(np.full((2, 30, 30), 9), "flat_field", exposure_s=0.01)
@@ -677,6 +691,12 @@ CALLS = {
     "tiles.capture_tiles": lambda o: list(tiles.capture_tiles(o.simple, o.scene, exposure_s=0.01, seed=0)),
     "tiles.read_tiles": lambda o: tiles.read_tiles(o.tiled.path).picture(),
     "tiles.write_tiles": lambda o: tiles.write_tiles(o.path(".zarr"), o.simple, o.scene, exposure_s=0.01, seed=0),
+    "twin.fit": lambda o: o.twin.estimates,
+    "twin.read_stacks": lambda o: [list(each) for each in fs.twin.read_stacks(o.stacks)],
+    "twin.read_twin": lambda o: (o.twin.save(path := o.path(".npz")), fs.twin.read_twin(path)),
+    "twin.Twin.plot": lambda o: o.twin.plot(),
+    "twin.Twin.sensor": lambda o: o.twin.sensor(),
+    "twin.Twin.write": lambda o: (o.twin.write(o.path(".html")), o.twin.write_figures(o.directory)),
     "twin.compare_with": lambda o: o.twins.plot(),
     "twin.PictureComparison.to_pandas": lambda o: o.twins.to_pandas(),
     "twin.fit_event_pixels": lambda o: fs.twin.fit_event_pixels(
@@ -826,6 +846,7 @@ COMMANDS = {
         "10",
     ],
     "video zarr": lambda o: [o.text(".yaml", PHOTOGRAPHED), "--frames", o.photos / "cats", "--out", o.path(".zarr")],
+    "twin": lambda o: [o.stacks, "--bits", "12", "--pixel-um", "3", "--out", o.path("")],
     "schema": lambda o: ["sweep"],
     "new": lambda o: ["study", "--out", o.path(".yaml")],
 }

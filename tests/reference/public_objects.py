@@ -31,6 +31,11 @@ from foveasim.sensor import effects
 MANY = np.linspace(0.0, 1.0, 1000)
 TABLE = tuple(np.linspace(400.0, 700.0, 200))
 SITES = fs.layout.grid(40, 30, 2.0)
+STACK = twin.Stack(np.ones((4, 32, 32), np.uint16), exposure_s=0.01, light=0, name="dark")
+TWIN = twin.Twin(
+    dict.fromkeys(("gain_dn_per_e", "black_level_dn", "read_noise_e"), twin.Estimate(1.0, 0.5, 2.0)), {"qe": "no photons"},
+    dict.fromkeys(("offset_e", "response_fraction"), np.ones((32, 32))), (), ("a constant lamp",), 3.0, {"bits": 12}, 3,
+)  # fmt: skip
 STATIC = twin.StaticRecording(np.full((4, 60), 9), np.full((4, 60), 2), bin_s=10.0)
 OPTICS = fs.Optics(focal_length_mm=8.0, f_number=2.8)
 OPTICS_OVER_FIELD = fs.Optics(
@@ -155,7 +160,7 @@ def public_objects(directory):
         config.Source(file=Path("sweep.yaml"), keys=("shot",), index="3"), layout.SolveFor(name="n_x", is_integer=True, is_increasing=True, guess=len),
         compare.budget_of(CAMERA, 30.0), fs.metrics.metric_info("psnr_db"), compare.median_interval(np.ones((50, 5))), compare.SceneCovariance(np.ones(50), np.ones(50)),
         compare.quality_by_eccentricity(capture.picture(), capture.picture(), edges_um=np.array([0.0, 20.0])),
-        twins, twins.deviations[0],
+        twins, twins.deviations[0], twin.Estimate(1.0, 0.5, 2.0), STACK, TWIN,
         compare.cameras({"a": CAMERA, "b": CAMERA}, {"flat": SCENE}, exposure_s=0.01, n_annuli=2),
         reconstruct.ColourCorrection(np.eye(3), np.zeros(24), np.zeros(24)),
         reconstruct.CorticalImage(data=np.ones((1, 20, 30)), radius_um=np.arange(21.0), start_rad=np.zeros(20)),

@@ -10,10 +10,12 @@ _codes = [types.Array(kind, 3, "C", readonly=True) for kind in (types.uint8, typ
 _sums = types.int64[:, ::1]
 
 
-@njit([types.void(codes, _sums, _sums, _sums, _sums) for codes in _codes])
-def add_frames(codes, sums, squares, rows, columns):
+@njit([types.void(codes, _sums, _sums, _sums, _sums, _sums) for codes in _codes])
+def add_frames(codes, sums, squares, products, rows, columns):
     """
-    Add codes (n_frame, n_y, n_x) to sums and squares (n_y, n_x), and to sums of rows and columns of each frame.
+    Add codes (n_frame, n_y, n_x) to the sums of pixels and lines.
+
+    Of pixels: sums, squares and products with the sum of the row, (n_y, n_x).
 
     ``rows`` (n_frame, n_y) and ``columns`` (n_frame, n_x). Rows of a frame are next to each other in memory, so that sums of
     one row stay in the cache for all frames.
@@ -28,3 +30,5 @@ def add_frames(codes, sums, squares, rows, columns):
                 squares[y, x] += value * value
                 columns[k, x] += value
             rows[k, y] += total
+            for x in range(codes.shape[2]):
+                products[y, x] += total * types.int64(codes[k, y, x])

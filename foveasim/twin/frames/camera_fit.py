@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,6 +24,8 @@ from foveasim.twin.frames.statistics import StackStatistics, StackSums, sum_fram
 __all__ = ["fit"]
 
 PIXEL = Limits(above=0.0, low=0.1, at_most=1e3, hint="the side of a pixel, in µm")
+#: Arrays of the sums of a stack.
+SUMS = tuple(each.name for each in fields(StackSums))
 #: Largest fraction of dark codes that are 0 (EMVA 1288).
 MAX_ZERO_FRACTION = 0.005
 
@@ -148,13 +151,13 @@ def _statistics(name: str, stack: Stack, bits: int, resume: Path | None) -> Stac
     if path is not None and path.is_file():
         try:
             _, arrays = read_archive(path)
-            return StackStatistics.of(StackSums(*(arrays[each] for each in ("sums", "squares", "rows", "columns"))))
+            return StackStatistics.of(StackSums(*(arrays[each] for each in SUMS)))
         except (FoveasimError, KeyError, ValueError, OSError):
             path.unlink()
     total = sum_frames(name, _checked(name, stack, bits))
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        arrays = {each: getattr(total, each) for each in ("sums", "squares", "rows", "columns")}
+        arrays = {each: getattr(total, each) for each in SUMS}
         write_archive(path, {}, arrays, is_compressed=False)
     return StackStatistics.of(total)
 
@@ -182,7 +185,11 @@ def _checked(name: str, stack: Stack, bits: int) -> Iterator[NDArray[Any]]:
 
 
 def _sums_path(resume: Path, stack: Stack) -> Path | None:
-    """Return the file for the sums of a stack of files, which depends on their names, sizes and times; None for arrays."""
+    """
+    Return the file for the sums of a stack of files, None for arrays.
+
+    It depends on names, sizes and times of the files.
+    """
     if isinstance(stack.frames, np.ndarray) or not all(isinstance(each, str | Path) for each in stack.frames):
         return None
     states = []

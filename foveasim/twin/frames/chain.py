@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,11 +34,26 @@ MARGIN_SIGMAS, LARGEST_E = 12.0, 1e12
 
 @dataclass(frozen=True)
 class Spread:
-    """Standard deviations over pixels: of response and dark current over their means, and of offsets, e-."""
+    """
+    Standard deviations over pixels.
+
+    Those of response and dark current are relative to their means, that of offsets is in e-.
+    """
 
     response_fraction: float = 0.0
     offset_e: float = 0.0
     dark_fraction: float = 0.0
+    #: Relative errors of the three.
+    errors: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def deviating(self) -> list[Spread]:
+        """Return the spreads that are one standard error larger in one of the three."""
+        names = ("response_fraction", "offset_e", "dark_fraction")
+        return [
+            replace(self, **{name: getattr(self, name) * (1.0 + error)})
+            for name, error in zip(names, self.errors, strict=True)
+            if error and getattr(self, name)
+        ]
 
     def is_close(self, other: Spread) -> bool:
         """Whether another spread has nearly the same effect."""
@@ -47,7 +62,7 @@ class Spread:
 
     @cached_property
     def pixels(self) -> tuple[Floats, Floats, Floats]:
-        """Responses, offsets in e- and factors of the dark current of pixels that represent all, (n,) each."""
+        """Responses, offsets (e-) and factors of the dark current of some pixels, (n,) each."""
         if not (self.response_fraction or self.offset_e or self.dark_fraction):
             return np.ones(1), np.zeros(1), np.ones(1)
         normal = ndtri((np.multiply.outer(LATTICE, np.arange(N_PIXELS)) % N_PIXELS + 0.5) / N_PIXELS)
@@ -76,7 +91,7 @@ class Moments(NamedTuple):
         return np.concatenate((self.mean_dn, self.variance_dn2))
 
     def sampling(self) -> Floats:
-        """Return the covariance of the statistics of one pixel by what differs between pixels, (2 n_level, 2 n_level)."""
+        """Return the covariance of statistics over pixels, (2 n_level, 2 n_level)."""
         off = self.of_pixels - self.of_pixels.mean(axis=1, keepdims=True)
         return np.asarray(off @ off.T / off.shape[1])
 

@@ -33,9 +33,9 @@ class DarkSpread(NamedTuple):
 
 def fit_dark_spread(slopes: Floats, noise: Floats) -> DarkSpread | None:
     """
-    Fit the distribution to slopes (n_pixel,) with variances of their noise; None if the noise hides the spread.
+    Fit the distribution of dark currents; None if the noise hides their spread.
 
-    Both are in any unit, and in its square.
+    ``slopes`` (n_pixel,), in any unit, and variances of their ``noise``, in its square.
     """
     from scipy import optimize
     from scipy.special import ndtr

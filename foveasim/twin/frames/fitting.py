@@ -1,4 +1,4 @@
-"""From stacks of frames to the parameters of a sensor: defects, chain, and what differs between pixels."""
+"""Parameters of a sensor from stacks: defects, chain, differences between pixels."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtri
 
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.errors import ParameterError
@@ -26,8 +27,8 @@ __all__ = ["StackLight", "fit_statistics"]
 SATURATING, FULL = 0.6, 0.15
 #: Largest part of the saturation of levels for the response of pixels.
 LINEAR_FRACTION = 0.8
-#: Response below which a pixel is dead, and robust standard deviations above which it is hot.
-DEAD_RESPONSE, HOT_SIGMAS = 0.5, 8.0
+#: Response below which a pixel is dead, and probability that any other pixel is taken for a hot one.
+DEAD_RESPONSE, HOT_PROBABILITY = 0.5, 0.01
 #: Standard error of the nonlinearity up to which it is fitted.
 MAX_NONLINEARITY_ERROR = 0.1
 #: Dark variance below which quantisation hides noise (EMVA 1288), DN².
@@ -180,7 +181,7 @@ class _Fit:
         return self.classes >= 0
 
     def _find_hot(self) -> None:
-        """Find pixels with much more dark current than others; needs dark stacks of two exposure times."""
+        """Find pixels with much more dark current than others, by two exposure times."""
         shape = self.statistics[0].shape
         self.is_hot = np.zeros(shape, np.bool_)
         self.dark_slope_dn = self.dark_slope_noise = None
@@ -193,8 +194,12 @@ class _Fit:
         slope = np.tensordot(factor, np.stack([self.linear[k].mean_dn for k in self.dark]), 1)
         noise = np.tensordot(factor**2 / n, np.stack([self.linear[k].variance_dn2 for k in self.dark]), 1)
         self.dark_slope_dn, self.dark_slope_noise = slope, noise
+        # Above the tail of a log-normal distribution with these quantiles.
         middle, above = np.quantile(slope, (0.5, 0.8413))
-        self.is_hot = slope > middle + HOT_SIGMAS * max(above - middle, math.sqrt(float(np.median(noise))))
+        tail = float(ndtri(1.0 - HOT_PROBABILITY / slope.size))
+        spread = math.log(max(above, middle) / middle) if middle > 0.0 else 0.0
+        noise_dn = math.sqrt(float(np.median(noise)))
+        self.is_hot = slope > max(middle * math.exp(spread * tail), middle + tail * max(above - middle, noise_dn))
         self.classes = np.where(self.is_hot, -1, self.classes)
 
     def _find_dead(self) -> None:
@@ -275,7 +280,7 @@ class _Fit:
         return found
 
     def _full_well(self, before: PooledFit, start_e: Floats) -> float:
-        """Return the full well with the mean of the highest level, for the other parameters of the fit before, e-."""
+        """Return the full well with the mean of the highest level, after a fit without it, e-."""
         from scipy.optimize import brentq
 
         assert self.well_e is not None
@@ -301,7 +306,7 @@ class _Fit:
 
     def _without_telegraph(self, levels: Levels, before: PooledFit | None) -> tuple[Levels, Floats]:
         """
-        Return the levels without the variance of unrecognised RTS pixels, and the error of the dark variance.
+        Return the levels without RTS noise, and the error of the dark variance.
 
         Pixels have the probability that they are free of RTS noise as weights. The dark variance is that of the mixture.
         """
@@ -312,11 +317,11 @@ class _Fit:
             own = self.classes == c
             if stack == self.telegraph_stack:
                 linear_dn2 = self.linear[stack].variance_dn2[own]
-                scale = float(levels.common_dn2[k] + variances[k] @ levels.weights) / float(
+                scale = float(levels.column_dn2[k] + variances[k] @ levels.weights) / float(
                     np.average(linear_dn2, weights=1.0 - p[own])
                 )
                 variances[k] += scale * self.telegraph.noise_dn2 - float(
-                    levels.common_dn2[k] + variances[k] @ levels.weights
+                    levels.column_dn2[k] + variances[k] @ levels.weights
                 )
                 errors[k] = scale * self.telegraph.noise_error_dn2
             else:
@@ -325,7 +330,7 @@ class _Fit:
         return replace(levels, variances_dn2=variances), errors
 
     def _slope_ratios(self, levels: Levels, before: PooledFit | None) -> Floats:
-        """Return slopes of codes by charges over that of the dark level, by the widths of codes, or the chain, (n_level,)."""
+        """Return slopes of codes by charges over that of the dark level, (n_level,)."""
         widths = self.adc.width_of_code_dn(levels.mean_dn.clip(0.0, self.adc.n_codes - 1.0))
         slopes = 1.0 / widths
         if before is not None:
@@ -465,10 +470,21 @@ class _Fit:
         self.prnu, self.dsnu = prnu, dsnu
         total_offset = math.sqrt(max(sum(dsnu[part][0] for part in ("row", "column", "pixel")), 0.0))
         self.dark_spread = self._dark_spread()
+        weights, dark = self.levels.weights, self.dark_spread
+        prnu2, of_blocks = prnu["pixel"]
+        has_response = bool(bright) and prnu2 > 0.0
+        offset_error = math.sqrt(0.5 / self.good.sum())
+        if dsnu["pixel"][0] > 0.0:
+            offset_error = 0.5 * _error(dsnu["pixel"][1], weights) / dsnu["pixel"][0]
         return Spread(
-            math.sqrt(max(prnu["pixel"][0], 0.0)) if bright else 0.0,
+            math.sqrt(prnu2) if has_response else 0.0,
             total_offset / gain,
-            0.0 if self.dark_spread is None else self.dark_spread.fraction,
+            0.0 if dark is None else dark.fraction,
+            (
+                0.5 * _error(of_blocks, weights) / prnu2 if has_response else 0.0,
+                min(offset_error, 1.0),
+                0.0 if dark is None else dark.log_error,
+            ),
         )
 
     def _dark_spread(self) -> DarkSpread | None:
@@ -487,13 +503,13 @@ class _Fit:
         return np.where(self.good, found, 0.0)
 
     def _line_noise(self) -> dict[str, float]:
-        """Return the part of the mean squares of rows and columns of the dark mean image by their temporal noise, DN²."""
+        """Return the temporal part of the mean squares of lines of the dark mean image, DN²."""
         frames = sum(self.statistics[k].n_frames for k in self.shortest)
         squares = self._mean_squares()
         return {name: (squares[name] - squares["pixel"]) / frames for name in ("row", "column")}
 
     def _mean_squares(self) -> dict[str, float]:
-        """Return the mean squares of rows, columns and pixels over the dark frames of the shortest exposure, DN²."""
+        """Return the mean squares of lines and pixels over the shortest dark frames, DN²."""
         n = {k: self.statistics[k].n_frames - 1 for k in self.shortest}
         each = {k: self.linear[k].mean_squares_dn2 for k in self.shortest}
         return {part: sum(n[k] * each[k][part] for k in n) / sum(n.values()) for part in ("row", "column", "pixel")}
@@ -502,7 +518,7 @@ class _Fit:
         self, values: Floats, noise: Floats, lines: Mapping[str, float] | None = None
     ) -> dict[str, tuple[float, Any]]:
         """
-        Return the variances of rows, columns and pixels over the sites, without that of temporal noise.
+        Return the variances of rows, columns and pixels, without temporal noise.
 
         Each with what its interval needs: mean squares and degrees of freedom of rows and columns, block means of pixels.
         """
@@ -691,7 +707,7 @@ def _selected(levels: Levels, index: Ints) -> Levels:
         "n_pixels",
         "means_dn",
         "variances_dn2",
-        "common_dn2",
+        "column_dn2",
         "mean_noise_dn2",
     )
     return replace(levels, **{name: getattr(levels, name)[index] for name in names})

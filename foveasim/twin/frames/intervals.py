@@ -27,14 +27,18 @@ class Uncertain(NamedTuple):
 
 
 def _quantile(n_blocks: int | None) -> float:
-    """Return the two-sided quantile of Student's distribution, or of the normal one without a number of blocks."""
+    """Return the two-sided quantile of Student's distribution; None for the normal one."""
     from scipy.special import ndtri, stdtrit
 
     return float(ndtri(1.0 - TAIL) if n_blocks is None else stdtrit(max(n_blocks - 1, 1), 1.0 - TAIL))
 
 
 def of_mean(value: float, error: float, n_blocks: int | None = None, *, is_log: bool = False) -> Estimate:
-    """Return the interval of a Gaussian estimate; ``error`` is that of the logarithm with ``is_log``."""
+    """
+    Return the interval of a Gaussian estimate.
+
+    ``error`` is that of the logarithm with ``is_log``.
+    """
     half = _quantile(n_blocks) * error
     if is_log:
         return Estimate(value, value * math.exp(-half), value * math.exp(half))
@@ -42,14 +46,20 @@ def of_mean(value: float, error: float, n_blocks: int | None = None, *, is_log: 
 
 
 def of_variance(variance: float, error: float, n_blocks: int | None = None) -> Estimate:
-    """Return a standard deviation and its interval, from 0 where that of the variance contains 0."""
+    """
+    Return a standard deviation and its interval.
+
+    It begins at 0 where that of the variance contains 0.
+    """
     half = _quantile(n_blocks) * error
     return Estimate(*(math.sqrt(max(each, 0.0)) for each in (variance, variance - half, variance + half)))
 
 
 def of_squares(square: float, degrees: int, other: float, n: int) -> Estimate:
     """
-    Return the standard deviation of lines of n pixels from the mean square of lines, n v + ``other``.
+    Return the standard deviation of lines of n pixels by their mean square.
+
+    It is ``n`` times the variance of lines plus ``other``.
 
     Mean squares of Gaussian values have chi-square distributions; that of pixels has so many degrees that it is known.
     """

@@ -1,4 +1,4 @@
-"""Pooled statistics of stacks: mean and variance of each class of pixels, in blocks of rows."""
+"""Mean and variance of stacks for each class of pixels, in blocks of rows."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Levels:
     n_frames, n_pixels : (n_level,) int
     means_dn, variances_dn2 : (n_level, n_block) float64, DN and DN²
         Means over the pixels of each block of rows; variances of pixels, without what rows, columns and frames share.
-    common_dn2 : (n_level,) float64, DN²
-        Variance that rows, columns and frames share.
+    column_dn2 : (n_level,) float64, DN²
+        Variance that columns share, which is not in ``variances_dn2``.
     mean_noise_dn2 : (n_level,) float64, DN²
         Variance of the mean over all pixels and frames due to temporal noise.
     weights : (n_block,) float64
@@ -40,7 +40,7 @@ class Levels:
     n_pixels: Ints
     means_dn: Floats
     variances_dn2: Floats
-    common_dn2: Floats
+    column_dn2: Floats
     mean_noise_dn2: Floats
     weights: Floats
 
@@ -57,20 +57,19 @@ class Levels:
     @classmethod
     def of(cls, stacks: list[StackStatistics], classes: Ints, share: Floats | float = 1.0) -> Levels:
         """
-        Return the levels of stacks for classes of pixels, (n_y, n_x) int from 0, or -1 for none.
+        Return the levels of stacks for classes of pixels.
 
-        ``share`` (n_y, n_x): weights of pixels.
+        ``classes`` (n_y, n_x): from 0, or -1 for none. ``share`` (n_y, n_x): weights of pixels.
         """
         weights = block_weights(classes)
         rows: dict[str, list[Any]] = {each.name: [] for each in fields(cls) if each.name != "weights"}
         n_pixels = np.bincount(classes[classes >= 0])
         for k, each in enumerate(stacks):
-            common_dn2 = each.common_dn2()
             means = block_means(each.mean_dn, classes, share)
-            variances = block_means(each.variance_dn2 - common_dn2[:, None], classes, share)
+            variances = block_means(each.variance_dn2 - each.column_dn2, classes, share)
             noise_dn2 = each.frame_variance_dn2() / each.n_frames
             for c, (mean, variance) in enumerate(zip(means, variances, strict=True)):
-                found = k, c, each.n_frames, n_pixels[c], mean, variance, common_dn2.mean(), noise_dn2
+                found = k, c, each.n_frames, n_pixels[c], mean, variance, each.column_dn2, noise_dn2
                 for name, value in zip(rows, found, strict=True):
                     rows[name].append(value)
         return cls(**{name: np.array(each) for name, each in rows.items()}, weights=weights)
@@ -87,7 +86,7 @@ def block_weights(classes: Ints) -> Floats:
 
 
 def block_means(values: Floats, classes: Ints, share: Floats | float = 1.0) -> Floats:
-    """Return the means of values of pixels over each class and block, (n_class, n_block), with weights of the pixels."""
+    """Return the weighted means of pixels over each class and block, (n_class, n_block)."""
     blocks = _blocks(classes)
     found = []
     for c in range(int(classes.max()) + 1):

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,7 +25,7 @@ __all__ = ["Exposures", "PooledFit", "fit_levels"]
 
 #: Relative step of numerical derivatives, largest change of a logarithm in one iteration, largest number of iterations, and
 #: decrease of the sum of squares that ends them.
-STEP, MAX_CHANGE, MAX_ITERATIONS, TOLERANCE = 1e-4, 0.7, 40, 1e-3
+STEP, MAX_CHANGE, MAX_ITERATIONS, TOLERANCE = 1e-4, 0.7, 40, 1e-2
 #: Parameters whose logarithms are fitted.
 POSITIVE = ("gain_dn_per_e", "full_well_e", "qe", "light_e_per_s", "dark_doubling_k", "level_e")
 WELL, BEND = "full_well_e", "nonlinearity_fraction"
@@ -37,12 +37,14 @@ DAMPING, MAX_DAMPING = 1e-3, 1e8
 SMALLEST_DN2 = 1e-4
 #: Noise of means in weights, as a fraction of codes: the chain's rounding.
 MEAN_FLOOR_DN = 1e-3
+#: Variance below which noise is between two codes, and errors of means, and of variances as a fraction, there.
+ROUGH_DN2, ROUGH_MEAN_DN, ROUGH_FRACTION = 0.6, 0.02, 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Exposures:
     """
-    What is known of the light of each level.
+    Exposure times, light and temperatures of levels.
 
     ``exposure_s`` (n_level,). ``light`` (n_level,): photons, or relative light times seconds; 0 in the dark, NaN if unknown.
     ``light_parameter`` (n_level,): name of the parameter that it multiplies. ``temperature_k`` (n_level,), or NaN.
@@ -110,6 +112,7 @@ def fit_levels(
     """
     model = _Model(chain, levels, exposures, tuple(start), start_e, fixed_e)
     vector = model.pack(start)
+    model.add_errors_of_spread(vector)
     damping = DAMPING
     moments = model.moments(vector)
     whiten = model.whitening(moments)
@@ -152,16 +155,17 @@ class _Model:
     fixed_e: Floats
 
     def __post_init__(self) -> None:
+        self.common = np.zeros((2 * self.levels.mean_dn.size,) * 2)
         self.free = np.flatnonzero(self.exposures.is_free & np.isnan(self.fixed_e))
         positive = [any(name.startswith(each) for each in POSITIVE) for name in self.names]
         self.is_log = np.array([*positive, *[True] * self.free.size])
 
     def pack(self, values: Mapping[str, float]) -> Floats:
         """
-        Return the vector of fitted variables: signals in codes instead of charges, and logarithms of positive ones.
+        Return the vector of fitted variables.
 
-        Means are known much better than the gain: as functions of signals they do not depend on it, so that the valley of the
-        likelihood is straight.
+        They are signals in codes instead of charges, and logarithms of positive ones. Means are known much better than the
+        gain: as functions of signals they do not depend on it, so that the valley of the likelihood is straight.
         """
         gain = values["gain_dn_per_e"]
         found = np.array([*(values[name] for name in self.names), *self.start_e[self.free]], np.float64)
@@ -214,6 +218,13 @@ class _Model:
             dark_e = dark_e * 2.0 ** ((self.exposures.temperature_k - reference_k) / values["dark_doubling_k"])
         return values, light_e, dark_e
 
+    def add_errors_of_spread(self, vector: Floats) -> None:
+        """Include the errors of the spread over pixels, which the chain takes as known, in the covariance."""
+        at = self.moments(vector).statistics
+        for spread in self.chain.spread.deviating():
+            change = replace(self.chain, spread=spread).moments(*self.charges(vector)).statistics - at
+            self.common += np.multiply.outer(change, change)
+
     def moments(self, vector: Floats) -> Moments:
         """Return the moments of the levels."""
         return self.chain.moments(*self.charges(vector))
@@ -228,20 +239,27 @@ class _Model:
         # Gaussian noise, and two codes where there is no other: s⁴ has the variance 2 V², and V (1 - 4 V).
         of_pixel = 2.0 * variance**2 + np.maximum(variance * (1.0 - 4.0 * variance), 0.0)
         of_variance = of_pixel / (self.levels.n_pixels * (self.levels.n_frames - 1))
-        return np.concatenate((self.levels.mean_noise_dn2 + MEAN_FLOOR_DN**2, of_variance))
+        # Between two codes, moments depend on where pixels are in a code, which is known to a part of it only.
+        is_rough = variance < ROUGH_DN2
+        of_mean = self.levels.mean_noise_dn2 + np.where(is_rough, ROUGH_MEAN_DN, MEAN_FLOOR_DN) ** 2
+        return np.concatenate((of_mean, of_variance + np.where(is_rough, ROUGH_FRACTION * variance, 0.0) ** 2))
 
     def whitening(self, moments: Moments) -> Callable[[Floats], Floats]:
-        """Return the map to uncorrelated statistics of variance 1: by temporal noise, and the responses of the pixels."""
+        """Return the map to uncorrelated statistics of variance 1, for noise and pixels."""
         from scipy.linalg import solve_triangular
 
-        matrix = moments.sampling() / np.tile(self.levels.n_pixels, 2)
+        matrix = moments.sampling() / np.tile(self.levels.n_pixels, 2) + self.common
         matrix[np.diag_indices_from(matrix)] += self.noise(moments)
         scale = np.sqrt(np.diag(matrix))
         factor = np.linalg.cholesky(matrix / np.multiply.outer(scale, scale))
         return lambda values: np.asarray(solve_triangular(factor, (values.T / scale).T, lower=True))
 
     def jacobian(self, vector: Floats, at: Floats) -> Floats:
-        """Return the derivatives of the statistics, which are ``at``; charges of levels are changed all at once."""
+        """
+        Return the derivatives of the statistics, which are ``at``.
+
+        Charges of levels of unknown light are changed all at once.
+        """
         n_levels, n = self.levels.mean_dn.size, len(self.names)
         found = np.zeros((2 * n_levels, vector.size))
 
@@ -286,6 +304,7 @@ class _Model:
         off[known] = 0.0
         n_blocks = levels.weights.size
         over_blocks = (off * levels.weights**2) @ off.T * n_blocks / max(n_blocks - 1, 1)
+        over_blocks += self.common
         over_blocks[known, known] = variance_error_dn2[known - levels.mean_dn.size] ** 2
         values, free_e = self.unpack(vector)
         values |= {f"level_e_{k}": float(value) for k, value in zip(self.free, free_e, strict=True)}

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ from foveasim.sensor.effects.measured import ColumnNoise, OffsetMap, ResponseMap
 from foveasim.twin.frames.chain import SWING_V
 from foveasim.twin.frames.intervals import Estimate, Uncertain
 from foveasim.units import ELEMENTARY_CHARGE_C
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["Twin", "read_twin"]
 
@@ -67,6 +71,8 @@ class Twin:
     pixel_um : float, µm
     known : mapping
         Parameters that were given: bits, mosaic, and those of the ADC.
+    n_fitted : int
+        Number of parameters of the chain, and of levels of unknown light, that were fitted.
     """
 
     estimates: Mapping[str, Estimate]
@@ -76,6 +82,7 @@ class Twin:
     assumptions: tuple[str, ...]
     pixel_um: float
     known: Mapping[str, Any]
+    n_fitted: int
 
     def __repr__(self) -> str:
         n_y, n_x = next(iter(self.maps.values())).shape
@@ -104,6 +111,57 @@ class Twin:
         from foveasim.view import to_html
 
         return to_html(self)
+
+    @property
+    def chi_square_ratio(self) -> float:
+        """Chi-square of the levels per degree of freedom: near 1 where the chain explains them."""
+        residuals = [row[f"{name}_residual"] for row in self.levels for name in ("mean", "variance")]
+        return float(np.square(residuals).sum()) / max(len(residuals) - self.n_fitted, 1)
+
+    def plot(self, *, ax: Axes | None = None) -> Axes:
+        """Draw the photon transfer, measured and by the fit, on matplotlib axes."""
+        from foveasim.twin.frames.report import draw_transfer
+        from foveasim.view.plots.figures import new_figure
+
+        axes = new_figure((5.0, 3.5)).subplots() if ax is None else ax
+        draw_transfer(self, axes)
+        axes.legend()
+        return axes
+
+    def write(self, path: str | Path) -> None:
+        """
+        Write the report, a web page, atomically.
+
+        Raises
+        ------
+        FileError
+            When the extension is not ``.html``, or the file cannot be written.
+        """
+        from foveasim.twin.frames.report import report_page
+        from foveasim.view.web._page import write_page
+
+        write_page(path, lambda: report_page(self))
+
+    def write_figures(self, directory: str | Path, extension: str = "pdf") -> list[Path]:
+        """
+        Write the figures of the report to a directory, and return their paths.
+
+        Raises
+        ------
+        FileError
+            When a file cannot be written.
+        """
+        from foveasim._io.atomic import atomic_write
+        from foveasim.twin.frames.report import FIGURES
+        from foveasim.view.web._report_page import figure_of
+
+        paths = []
+        for name, draw in FIGURES.items():
+            paths.append(Path(directory, f"{name}.{extension}"))
+            figure = figure_of(partial(draw, self), "black", "0.9")
+            with atomic_write(paths[-1]) as temporary:
+                figure.savefig(temporary, format=extension)
+        return paths
 
     def layout(self) -> Layout:
         """Return the grid of the camera's pixels, with rows, columns, readout lines and channels."""
@@ -165,7 +223,7 @@ class Twin:
         return found
 
     def _maps_of_sites(self) -> dict[str, Any]:
-        """Return the parameters of this device, in the order of the sites: the last row of the frames first."""
+        """Return the parameters of this device for its sites: the last row of frames first."""
 
         def of_sites(name: str) -> Floats:
             return np.ascontiguousarray(self.maps[name][::-1]).ravel()
@@ -201,6 +259,7 @@ class Twin:
             "assumptions": list(self.assumptions),
             "pixel_um": self.pixel_um,
             "known": dict(self.known),
+            "n_fitted": self.n_fitted,
         }
         write_archive(path, about, dict(self.maps))
 
@@ -227,6 +286,7 @@ def read_twin(path: str | Path) -> Twin:
             tuple(map(str, about["assumptions"])),
             float(about["pixel_um"]),
             MappingProxyType(about["known"]),
+            int(about["n_fitted"]),
         )
 
 
@@ -260,4 +320,5 @@ def twin_of(fitted: Any, names: list[str], pixel_um: float, known: Mapping[str, 
         tuple(fitted.assumptions),
         pixel_um,
         MappingProxyType(dict(known)),
+        len(fit.names),
     )

@@ -82,9 +82,6 @@ class Stack:
         check_declared(self)
         if self.light is not None and self.photons is not None:
             raise ParameterError("photons", "must not be given together with 'light'")
-        if self.is_dark and self.photons is not None:
-            object.__setattr__(self, "photons", None)
-            object.__setattr__(self, "light", 0.0)
 
     def __repr__(self) -> str:
         return f"Stack({self.name or 'frames'!r}, {self.exposure_s:g} s)"

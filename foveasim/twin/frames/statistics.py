@@ -25,23 +25,33 @@ __all__ = ["StackStatistics", "StackSums", "sum_frames"]
 MAX_BLOCKS = 64
 #: Probability of a difference between frames below which it is real, such as flicker of the light.
 MAX_PROBABILITY = 1e-3
+#: Number of columns above which the mean of a row is subtracted from its pixels.
+MIN_COLUMNS = 2
 #: Frames that are added at once, while a row of sums stays in the cache.
 BATCH = 8
 
 
 @dataclass(eq=False)
 class StackSums:
-    """Sums over the frames of a stack: (n_y, n_x) int64, and those of rows and columns, (n_frame, n_y) and (n_frame, n_x)."""
+    """
+    Sums over the frames of a stack.
+
+    ``sums``, ``squares``, ``products`` (n_y, n_x) int64: of codes, and with the sum of the row. ``rows`` (n_frame, n_y),
+    ``columns`` (n_frame, n_x): sums of lines.
+    """
 
     sums: Ints
     squares: Ints
+    products: Ints
     rows: Ints
     columns: Ints
 
 
 def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
     """
-    Return the sums over frames of codes, (n_y, n_x) uint8 or uint16 each, which are read once.
+    Return the sums over frames of codes, which are read once.
+
+    ``frames``: (n_y, n_x) uint8 or uint16 each.
 
     Raises ParameterError when there are fewer than two frames, of different sizes, or of other numbers.
     """
@@ -55,7 +65,7 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
         codes = np.ascontiguousarray(np.stack(batch))
         assert total is not None
         of_rows, of_columns = (np.zeros((len(batch), n), np.int64) for n in codes.shape[1:])
-        _kernels.add_frames(codes, total.sums, total.squares, of_rows, of_columns)
+        _kernels.add_frames(codes, total.sums, total.squares, total.products, of_rows, of_columns)
         rows.append(of_rows)
         columns.append(of_columns)
         batch.clear()
@@ -64,7 +74,7 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
         codes = check_frame(f"{name}, frame {k}", frame)
         if total is None:
             zeros = np.zeros(codes.shape, np.int64)
-            total = StackSums(zeros, zeros.copy(), zeros[:0], zeros[:0])
+            total = StackSums(zeros, zeros.copy(), zeros.copy(), zeros[:0], zeros[:0])
         elif codes.shape != total.sums.shape:
             raise ParameterError(
                 "frames",
@@ -121,7 +131,7 @@ class StackStatistics:
     mean_dn : (n_y, n_x) float64, DN
         Mean over frames; row 0 is that of the frames.
     variance_dn2 : (n_y, n_x) float64, DN²
-        Sample variance over frames.
+        Variance over frames of the deviation from the mean of the row: without what rows and frames share.
     row_dn, column_dn : (n_frame, n_y) and (n_frame, n_x) float64, DN
         Deviations of rows and columns of each frame from their mean over frames.
     """
@@ -136,13 +146,18 @@ class StackStatistics:
     def of(cls, total: StackSums) -> StackStatistics:
         """Return the statistics of sums."""
         n, (n_y, n_x) = len(total.rows), total.sums.shape
-        variance = (n * total.squares - total.sums**2) / float(n * (n - 1))
-        return cls(
-            n,
-            total.sums / n,
-            variance,
-            *(each / m - (each / m).mean(axis=0) for each, m in ((total.rows, n_x), (total.columns, n_y))),
+        row_dn, column_dn = (
+            each / m - (each / m).mean(axis=0) for each, m in ((total.rows, n_x), (total.columns, n_y))
         )
+        squares = (n * total.squares - total.sums**2) / n
+        with_row = total.products / n_x - total.sums * (total.rows.sum(axis=0) / (n * n_x))[:, None]
+        residual = squares - 2.0 * with_row + (row_dn**2).sum(axis=0)[:, None]
+        # The mean of a row contains the pixel: its deviation has the variance (1 - 2 / n_x) v + (mean of v over the row) / n_x.
+        residual /= n - 1
+        variance = residual
+        if n_x > MIN_COLUMNS:
+            variance = (residual - residual.mean(axis=1, keepdims=True) / (n_x - 1)) / (1.0 - 2.0 / n_x)
+        return cls(n, total.sums / n, np.maximum(variance, 0.0), row_dn, column_dn)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -162,24 +177,24 @@ class StackStatistics:
         frame = self.frame_dn[:, None]
         row = n_x * float(((self.row_dn - frame) ** 2).sum())
         column = n_y * float(((self.column_dn - frame) ** 2).sum())
-        total = (n - 1) * float(self.variance_dn2.sum()) - n_y * n_x * float((frame**2).sum())
-        degrees = {"row": (n - 1) * (n_y - 1), "column": (n - 1) * (n_x - 1)}
-        degrees["pixel"] = (n - 1) * (n_y - 1) * (n_x - 1)
-        found = {"row": row, "column": column, "pixel": total - row - column}
-        return {name: found[name] / max(degrees[name], 1) for name in found}
+        degrees = {"row": (n - 1) * (n_y - 1), "column": (n - 1) * (n_x - 1), "pixel": (n - 1) * (n_y - 1) * (n_x - 1)}
+        pixel = (n - 1) * (1.0 - 1.0 / n_x) * float(self.variance_dn2.sum()) - column
+        return {
+            name: each / max(degrees[name], 1) for name, each in (("row", row), ("column", column), ("pixel", pixel))
+        }
 
-    def common_dn2(self) -> Floats:
-        """Return the part of the variance of all pixels that rows, columns and frames share, for each row, (n_y,) DN²."""
-        (n_y, n_x), n = self.shape, self.n_frames
-        mean_dn2 = self.variance_dn2.mean(axis=1)
-        rows_dn2 = (self.row_dn**2).sum(axis=0) / (n - 1)
-        columns_dn2 = float(((self.column_dn - self.frame_dn[:, None]) ** 2).sum()) / ((n - 1) * n_x)
-        # Means of rows and columns contain the noise of pixels, too.
-        pixel_dn2 = (mean_dn2 - rows_dn2 - columns_dn2) / (1.0 - 1.0 / n_x - (n_x - 1.0) / (n_x * n_y))
-        return np.asarray(mean_dn2 - pixel_dn2)
+    @property
+    def column_dn2(self) -> float:
+        """Variance that the pixels of a column share, DN²; unbiased, and maybe negative."""
+        squares = self.mean_squares_dn2
+        return (squares["column"] - squares["pixel"]) / self.shape[0]
 
     def frame_variance_dn2(self) -> float:
-        """Return the variance of the mean of a frame, DN²: by pixels, rows and columns, or more if frames differ more."""
+        """
+        Return the variance of the mean of a frame, DN².
+
+        That of its pixels, rows and columns, or more if frames differ more, as by flicker.
+        """
         from scipy.special import chdtrc
 
         squares = self.mean_squares_dn2

@@ -49,9 +49,9 @@ class TelegraphFit:
 
 def fit_telegraph(variance_dn2: Floats, n_frames: int) -> TelegraphFit | None:
     """
-    Fit the mixture to the variances of pixels, (n_pixel,) DN²; None where one distribution explains them.
+    Fit the mixture to variances of pixels; None where one distribution explains them.
 
-    ``n_frames``: frames of each variance; at least ``MIN_FRAMES``.
+    ``variance_dn2`` (n_pixel,). ``n_frames``: frames of each variance; at least ``MIN_FRAMES``.
     """
     from scipy import optimize
 

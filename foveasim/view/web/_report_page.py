@@ -6,7 +6,7 @@ import base64
 import hashlib
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from itertools import zip_longest
@@ -16,12 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Colours of lines and text in figures, which the page replaces by those of its light or dark theme.
 INK, FAINT = "#010203", "#040506"
 #: Replacements in the light and the dark theme.
 LIGHT, DARK = {INK: "#1b2230", FAINT: "#d5d9e0"}, {INK: "#e8ebf0", FAINT: "#404857"}
+#: Size of figures.
+FIGURE_INCHES = (4.7, 3.1)
 POLICY = "default-src 'none'; style-src '{style}'; img-src data:; base-uri 'none'; form-action 'none'"
 
 
@@ -59,6 +62,32 @@ class ReportSection:
     tables: Sequence[ReportTable] = ()
     figures: Sequence[Sequence[ReportFigure]] = ()
     folded: tuple[str, str] | None = None
+
+
+def figure_of(draw: Callable[[Axes], None], ink: str, faint: str) -> Figure:
+    """Return a figure that a function draws, in colours of its text and its grid."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context({"text.parse_math": False}):
+        figure = Figure(figsize=FIGURE_INCHES, layout="constrained")
+        axes = figure.add_subplot()
+        draw(axes)
+        style_axes(axes, ink, faint)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False, fontsize=9, labelcolor=ink)
+    return figure
+
+
+def style_axes(axes: Axes, ink: str, faint: str) -> None:
+    """Draw axes and grid in colours of the text and the grid."""
+    axes.grid(color=faint, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(which="both", colors=ink)
+    for spine in axes.spines.values():
+        spine.set_color(ink)
+    for label in (axes.xaxis.label, axes.yaxis.label):
+        label.set_color(ink)
 
 
 def drawn_figure(figure: Figure, title: str, caption: str) -> ReportFigure:

@@ -1,0 +1,356 @@
+"""Sensors estimated from frames of a camera: recovery, coverage of intervals, files, and sensors afterwards."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import tifffile
+from scipy.constants import e as elementary_charge
+from scipy.stats import binom
+
+import foveasim as fs
+from foveasim.sensor.effects import RowNoise
+from foveasim.twin.frames.statistics import StackStatistics, sum_frames
+
+N_Y, N_X = 48, 64
+LAYOUT = fs.layout.readout_by(fs.layout.grid(n_x=N_X, n_y=N_Y, pitch_um=3.0), "column")
+TIMES_S = np.arange(1, 11) * 2e-3
+
+
+def numpy_stacks(gain, noise_e, black_dn, well_e, bits=12, n_frames=16):
+    """Stacks of Poisson and Gaussian numbers, without the package: dark, and levels of a constant lamp above the full well."""
+    rng = np.random.default_rng(7)
+
+    def frames(signal_e, n):
+        charge = np.minimum(rng.poisson(signal_e, (n, N_Y, N_X)), well_e) + rng.normal(0.0, noise_e, (n, N_Y, N_X))
+        return np.clip(np.floor(gain * charge + black_dn + 0.5), 0, 2**bits - 1).astype(np.uint16)
+
+    rate = 1.2 * well_e / TIMES_S[-1]
+    dark = fs.twin.Stack(frames(0.0, 64), 1e-3, light=0)
+    return [dark, *(fs.twin.Stack(frames(rate * time_s, n_frames), time_s, light=1) for time_s in TIMES_S)]
+
+
+def camera_of(seed):
+    """A random camera, and what a fit has to know of it."""
+    rng = np.random.default_rng(seed)
+    bits, companding = int(rng.integers(8, 15)), str(rng.choice(["linear", "linear", "root", "log"]))
+    n_codes, well_e = 2**bits, rng.uniform(4e3, 2e4)
+    gain = n_codes / well_e * rng.choice([0.83, 1.06])
+    noise_e, is_cds = max(rng.uniform(2.0, 8.0), 0.7 / gain if companding == "linear" else 0.0), rng.random() < 0.5
+    step_e = rng.uniform(5.0, 15.0) * noise_e if rng.random() < 0.5 else 0.0
+    offset = 0.5 * noise_e * gain / n_codes
+    black = (
+        max((6.0 * noise_e + 0.6 * step_e) * gain / n_codes, 0.0 if companding == "linear" else 0.01) + 2.0 / n_codes
+    )
+    parameters = {
+        "bits": bits, "companding": companding, "log_strength": 20.0, "v_sat_v": 1.0, "read_noise_e": noise_e,
+        "capacitance_f": n_codes * elementary_charge / gain, "pedestal_v": black, "full_well_e": well_e, "cds": is_cds,
+        "prnu_fraction": rng.uniform(0.004, 0.02), "dark_e_per_s": rng.uniform(50.0, 300.0),
+        "dsnu_fraction": rng.uniform(0.2, 0.5), "nonlinearity_fraction": rng.choice([0.0, 0.02, -0.01]),
+        "pixel_fpn_fraction": 0.0 if is_cds else offset, "line_fpn_fraction": offset * rng.integers(2),
+        "rts_fraction": rng.uniform(0.01, 0.05) * (step_e > 0.0), "rts_e": step_e, "device_seed": seed,
+    }  # fmt: skip
+    effects = [RowNoise(rng.uniform(0.3, 1.0) * noise_e)] if rng.random() < 0.5 else []
+    adc = {"bits": bits, "companding": companding} | ({"log_strength": 20.0} if companding == "log" else {})
+    return fs.Sensor(LAYOUT, effects=effects, **parameters), adc
+
+
+def stacks_of(sensor, seed=0, n_frames=16):
+    """Dark stacks of three exposure times, and flat stacks beyond the full well; the top row of frames is the last one."""
+
+    def frames(rate, exposure_s, n, own):
+        return np.stack(
+            [
+                sensor.expose(np.array([rate]), exposure_s, seed=own, frame=k)[2].reshape(N_Y, N_X)[::-1]
+                for k in range(n)
+            ]
+        )
+
+    rate = float(np.max(sensor.full_well_e)) * 1.3 / 0.02
+    dark = [(2e-3, 4 * n_frames), (0.1, n_frames), (0.5, n_frames)]
+    stacks = [fs.twin.Stack(frames(0.0, time_s, n, seed + k), time_s, light=0) for k, (time_s, n) in enumerate(dark)]
+    return [
+        *stacks,
+        *(
+            fs.twin.Stack(frames(rate, time_s, n_frames, seed + 10 + k), time_s, light=1)
+            for k, time_s in enumerate(0.02 * np.arange(1, 15) / 14)
+        ),
+    ]
+
+
+def truth_of(sensor):
+    """Parameters of a sensor in the terms of a twin; the black level is that of its sites."""
+    n_codes = 2**sensor.bits
+    gain = n_codes * elementary_charge / float(np.max(sensor.capacitance_f))
+    patterns = {effect.name for effect in sensor.chain} & {"pixel_fpn", "column_fpn"}
+    offset = sum(float(sensor.pattern(name).mean()) for name in patterns)
+    names = ("read_noise_e", "prnu_fraction", "dark_e_per_s", "dsnu_fraction", "full_well_e", "nonlinearity_fraction")
+    found = {name: float(np.max(getattr(sensor, name))) for name in (*names, "rts_fraction", "rts_e")} | {
+        "gain_dn_per_e": gain,
+        "black_level_dn": (sensor.pedestal_v + offset) * n_codes - 0.5,
+        "dsnu_column_e": sensor.line_fpn_fraction * n_codes / gain,
+        "row_noise_e": sensor.effects[0].noise_e if sensor.effects else 0.0,
+    }
+    if not sensor.cds:
+        found["dsnu_e"] = sensor.pixel_fpn_fraction * n_codes / gain
+    return found
+
+
+@pytest.fixture(scope="module")
+def stacks():
+    return numpy_stacks(0.4, 4.0, 60.0, 8000.0)
+
+
+@pytest.fixture(scope="module")
+def twin(stacks):
+    return fs.twin.fit(stacks, bits=12, pixel_um=3.0)
+
+
+def test_numpy_frames_are_recovered(twin):
+    """Intervals of 99.99 %, twice those of 95 %, contain the numbers of the draw."""
+    for name, value in (
+        ("gain_dn_per_e", 0.4), ("read_noise_e", 4.0), ("black_level_dn", 60.0), ("full_well_e", 8000.0),
+        ("nonlinearity_fraction", 0.0),
+    ):  # fmt: skip
+        found = twin.estimates[name]
+        assert abs(found.value - value) <= 2.0 * max(found.high - found.value, found.value - found.low), name
+    assert twin.estimates["gain_dn_per_e"].high / twin.estimates["gain_dn_per_e"].low < 1.02
+    assert twin.estimates["full_well_e"].high / twin.estimates["full_well_e"].low < 1.02
+    assert twin.chi_square_ratio < 2.0
+
+
+def test_missing_dark_series_is_said(twin):
+    for name in ("dark_e_per_s", "dsnu_fraction", "hot_fraction"):
+        assert "two exposure times" in twin.not_identifiable[name]
+    assert any("dark current is part of the black level" in text for text in twin.assumptions)
+
+
+def test_unknown_light_is_enough_for_the_gain():
+    """Photon transfer needs no exposure times: each level has its own charge."""
+    known = numpy_stacks(0.4, 4.0, 60.0, 8000.0)
+    unknown = [known[0], *(fs.twin.Stack(each.frames, 0.01) for each in known[1:])]
+    found = fs.twin.fit(unknown, bits=12, pixel_um=3.0)
+
+    assert found.estimates["gain_dn_per_e"].value == pytest.approx(0.4, rel=0.01)
+    assert found.estimates["read_noise_e"].value == pytest.approx(4.0, rel=0.02)
+
+
+def test_photons_give_the_quantum_efficiency():
+    known = numpy_stacks(0.4, 4.0, 60.0, 8000.0)
+    charges = 1.2 * 8000.0 * TIMES_S / TIMES_S[-1]
+    lit = [
+        fs.twin.Stack(each.frames, 0.01, photons=charge / 0.6) for each, charge in zip(known[1:], charges, strict=True)
+    ]
+    found = fs.twin.fit([known[0], *lit], bits=12, pixel_um=3.0)
+
+    assert found.estimates["qe"].value == pytest.approx(0.6, rel=0.01)
+    assert found.sensor().qe == found.value("qe")
+
+
+def test_quantisation_hides_noise():
+    found = fs.twin.fit(numpy_stacks(0.02, 4.0, 3.3, 8000.0, bits=8), bits=8, pixel_um=3.0)
+
+    assert "quantisation hides" in found.not_identifiable["read_noise_e"]
+    assert found.estimates["gain_dn_per_e"].value == pytest.approx(0.02, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+def test_intervals_contain_parameters_of_random_cameras():
+    """Each parameter, and all of them, as often as binomial numbers of 95 % allow."""
+    hits: dict[str, list[bool]] = {}
+    for seed in range(40):
+        sensor, adc = camera_of(seed)
+        found, truth = fs.twin.fit(stacks_of(sensor, seed), pixel_um=3.0, **adc), truth_of(sensor)
+        for name, value in truth.items():
+            if name in found.estimates and (value or not name.startswith("rts")):
+                each = found.estimates[name]
+                hits.setdefault(name, []).append(each.low <= value <= each.high)
+            elif name not in found.estimates:
+                assert found.not_identifiable[name]
+    for name, each in hits.items():
+        assert binom.cdf(sum(each), len(each), 0.95) > 1e-4, (name, sum(each), len(each))
+    assert 0.93 <= np.mean(np.concatenate(list(hits.values()))) <= 0.98
+
+
+def test_row_noise_is_not_noise_of_pixels():
+    """Mean squares of rows and pixels, by their definition over residuals."""
+    rng = np.random.default_rng(3)
+    codes = np.rint(
+        100.0 + rng.normal(0.0, 4.0, (8, 12, 10)) + rng.normal(0.0, 3.0, (8, 12, 1)) + rng.normal(0.0, 2.0, (8, 1, 10))
+    ).astype(np.uint16)
+    found = StackStatistics.of(sum_frames("stack", codes))
+    off = codes - codes.mean(axis=0)
+    row, column, frame = off.mean(axis=2), off.mean(axis=1), off.mean(axis=(1, 2))
+    left = off - row[:, :, None] - column[:, None, :] + frame[:, None, None]
+
+    squares = found.mean_squares_dn2
+    assert squares["row"] == pytest.approx(10 * ((row - frame[:, None]) ** 2).sum() / (7 * 11))
+    assert squares["column"] == pytest.approx(12 * ((column - frame[:, None]) ** 2).sum() / (7 * 9))
+    assert squares["pixel"] == pytest.approx((left**2).sum() / (7 * 11 * 9))
+
+
+def test_sensor_has_the_maps_of_the_camera():
+    """Sites of the fitted sensor correlate with those of the camera, also in their order."""
+    camera = fs.Sensor(
+        LAYOUT, bits=12, v_sat_v=1.0, capacitance_f=4096 * elementary_charge / 0.4, read_noise_e=4.0, pedestal_v=0.02,
+        full_well_e=9000.0, prnu_fraction=0.02, dsnu_e=6.0, dark_e_per_s=200.0, dsnu_fraction=0.5,
+    )  # fmt: skip
+    found = fs.twin.fit(stacks_of(camera), bits=12, pixel_um=3.0).sensor()
+    light_e = np.full(LAYOUT.n_sites, 4000.0)
+    codes, wanted = (
+        np.mean([each.expose(light_e, 1.0, seed=9, frame=k)[2] for k in range(32)], axis=0) for each in (found, camera)
+    )
+
+    assert np.corrcoef(codes, wanted)[0, 1] > 0.95
+    assert codes.mean() == pytest.approx(wanted.mean(), rel=5e-3)  # the error of the gain
+    assert codes.std() == pytest.approx(wanted.std(), rel=0.05)
+
+
+def test_sensor_works_where_others_do(twin):
+    sensor = twin.sensor()
+    copies = pickle.loads(pickle.dumps(sensor)), copy.deepcopy(sensor)
+    optics = fs.Optics(focal_length_mm=5.0, f_number=4.0)
+    scene = fs.Scene.flat(
+        shape=(64, 64),
+        pitch_um=800.0,
+        radiance_w_m2_sr_nm=0.02,
+        distance_m=1.0,
+        wavelength_nm=550.0,
+        band_width_nm=10.0,
+    )
+    captures = [
+        fs.Camera(optics=optics, sensor=each).capture(scene, exposure_s=0.01, seed=1) for each in (sensor, *copies)
+    ]
+
+    for capture in captures[1:]:
+        np.testing.assert_array_equal(capture.code, captures[0].code)
+    mean_dn, variance_dn2 = sensor.predict(np.full(sensor.layout.n_sites, 1000.0))
+    assert np.all(variance_dn2 > 0.0)
+    assert mean_dn.mean() == pytest.approx(460.0, rel=0.02)
+    restored = fs.Sensor.from_settings(sensor.layout, captures[0].settings["sensor"], sensor.arrays)
+    np.testing.assert_array_equal(restored.predict(np.full(sensor.layout.n_sites, 1000.0))[0], mean_dn)
+
+
+def test_other_layouts_scale_with_area(twin):
+    large = twin.sensor(fs.layout.grid(n_x=4, n_y=4, pitch_um=6.0))
+
+    np.testing.assert_allclose(large.full_well_e, 4.0 * twin.value("full_well_e"), rtol=1e-12)
+    assert large.linearise(np.full(16, 100.0)).gain_dn_per_e == pytest.approx(0.25 * twin.value("gain_dn_per_e"))
+    assert large.read_noise_e == twin.value("read_noise_e")
+
+
+def test_twins_are_read_as_written(twin, tmp_path):
+    twin.save(tmp_path / "twin.npz")
+    found = fs.twin.read_twin(tmp_path / "twin.npz")
+
+    assert found.estimates == twin.estimates
+    assert found.records()[0] == twin.records()[0]
+    np.testing.assert_array_equal(found.maps["offset_e"], twin.maps["offset_e"])
+    np.testing.assert_array_equal(
+        found.sensor().predict(np.full(N_X * N_Y, 50.0)), twin.sensor().predict(np.full(N_X * N_Y, 50.0))
+    )
+    with pytest.raises(fs.errors.FileError, match="not a valid foveasim twin"):
+        fs.twin.read_twin(__file__)
+
+
+def test_report_names_parameters_and_reasons(twin, tmp_path):
+    twin.write(tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+
+    for part in ("system gain K", "two exposure times", "Photon transfer", "95 % interval"):
+        assert part in page
+    assert {path.suffix for path in twin.write_figures(tmp_path)} == {".pdf"}
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(stacks, tmp_path):
+    for k, stack in enumerate((stacks[0], *stacks[3:9:2])):
+        kind = "dark" if stack.is_dark else "flat"
+        directory = tmp_path / "frames" / f"{kind}_{1e3 * stack.exposure_s:g}ms"
+        directory.mkdir(parents=True)
+        for n, frame in enumerate(stack.frames[:4]):
+            if k == 1:
+                np.save(directory / f"{n}.npy", frame)
+            else:
+                tifffile.imwrite(directory / f"{n}.tif", frame, photometric="minisblack")
+    return tmp_path / "frames"
+
+
+def test_folder_equals_arrays(folder, stacks, tmp_path):
+    found = fs.twin.read_stacks(folder)
+    assert (found[0].is_dark, found[0].exposure_s) == (True, 1e-3)
+    codes = list(found[1])
+    np.testing.assert_array_equal(
+        codes, next(each.frames[:4] for each in stacks if each.exposure_s == found[1].exposure_s)
+    )
+    (folder / "stacks.yaml").write_text(
+        "stacks:\n  - {frames: 'dark_1ms/*.tif', exposure_s: 0.001, light: 0}\n"
+        "  - {frames: 'flat*/*', exposure_s: 0.01, photons: 500}\n"
+    )
+    listed = fs.twin.read_stacks(folder)
+    assert [each.photons for each in listed] == [None, 500.0]
+
+
+def test_interrupted_fit_resumes(folder, tmp_path):
+    """Sums of stacks that have been read are used again, without their frames."""
+    whole = fs.twin.fit(folder, bits=12, pixel_um=3.0)
+
+    def stop(done, n):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fs.twin.fit(folder, bits=12, pixel_um=3.0, resume=tmp_path / "sums", progress=stop)
+    assert len(list((tmp_path / "sums").glob("*.npz"))) == 3
+    found = fs.twin.fit(folder, bits=12, pixel_um=3.0, resume=tmp_path / "sums")
+    assert found.estimates == whole.estimates
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("truncated", "0.tif: is corrupt or truncated"),
+        ("sizes", "must have the same size, but dark_1ms has frames of 64 x 48 pixels and 64 x 47 pixels"),
+        ("jpeg", "has been processed or compressed"),
+        ("single", "must be at least two per stack, but dark_1ms has 1"),
+        ("bits", "'bits' must be those of the codes: .* above 8 bits"),
+        ("no dark", "must contain a stack of dark frames"),
+        ("no light", "must contain stacks with light"),
+        ("shifted", "its codes are multiples of 16: divide them by it"),
+    ],
+)
+def test_wrong_folders_are_explained(folder, change, message, tmp_path):
+    dark, bits = folder / "dark_1ms", 8 if change == "bits" else 12
+    first = dark / "0.tif"
+    if change == "truncated":
+        first.write_bytes(first.read_bytes()[:-4000])
+    elif change == "sizes":
+        tifffile.imwrite(dark / "1.tif", np.zeros((47, 64), np.uint16), photometric="minisblack")
+    elif change == "jpeg":
+        first.rename(dark / "0.jpg")
+    elif change == "shifted":
+        tifffile.imwrite(first, 16 * tifffile.imread(dark / "1.tif") + np.uint16(8192), photometric="minisblack")
+    for path in sorted(dark.iterdir())[1:] if change == "single" else ():
+        path.unlink()
+    if change in ("no dark", "no light"):
+        for path in folder.glob("dark*" if change == "no dark" else "flat*"):
+            path.rename(path.with_name("other_" + path.name))
+    with pytest.raises(fs.FoveasimError, match=message) as caught:
+        fs.twin.fit(folder, bits=bits, pixel_um=3.0)
+    assert "\n" not in str(caught.value)
+
+
+def test_clipped_dark_frames_are_reported():
+    stacks = numpy_stacks(0.4, 4.0, 0.3, 8000.0)
+    with pytest.warns(fs.errors.FoveasimWarning, match="of the codes of stack 0 are 0"):
+        fs.twin.fit(stacks, bits=12, pixel_um=3.0)
+
+
+def test_folder_without_stacks_is_an_error(tmp_path):
+    with pytest.raises(fs.errors.FileError, match="contains no stacks"):
+        fs.twin.read_stacks(tmp_path)
