@@ -21,6 +21,8 @@ NODES = np.linspace(-5.0, 5.0, 401)
 N_BINS = 300
 #: Step of second derivatives, and smallest spread in units of its error.
 STEP, MIN_SIGMAS = 0.02, 3.0
+#: Largest logarithms of mean and spread in a search.
+LARGEST = np.array([30.0, 3.0])
 
 
 class DarkSpread(NamedTuple):
@@ -41,7 +43,7 @@ def fit_dark_spread(slopes: Floats, noise: Floats) -> DarkSpread | None:
     from scipy.special import ndtr
 
     mean, variance = float(slopes.mean()), float(slopes.var() - noise.mean())
-    if mean <= 0.0 or variance <= 0.0:
+    if variance <= 0.0 or mean < MIN_SIGMAS * math.sqrt(float(noise.mean()) / slopes.size):
         return None
     rise = np.cov(slopes, noise)[0, 1] / float(slopes.var())
     rise = min(max(float(rise), 0.0), float(noise.mean()) / mean)
@@ -54,7 +56,8 @@ def fit_dark_spread(slopes: Floats, noise: Floats) -> DarkSpread | None:
     weights /= weights.sum()
 
     def negative(vector: Floats) -> float:
-        centre, sigma = math.exp(vector[0]), math.sqrt(math.log1p(math.exp(2.0 * vector[1])))
+        centre, fraction = np.exp(np.clip(vector, -30.0, LARGEST))
+        sigma = math.sqrt(math.log1p(fraction**2))
         current = centre * np.exp(sigma * NODES - 0.5 * sigma**2)
         width = np.sqrt(max(floor, 1e-12 * mean**2) + rise * current)
         below = weights @ ndtr((inner - current[:, None]) / width[:, None])

@@ -219,7 +219,7 @@ class _Model:
         return values, light_e, dark_e
 
     def add_errors_of_spread(self, vector: Floats) -> None:
-        """Include the errors of the spread over pixels, which the chain takes as known, in the covariance."""
+        """Include the errors of the spread over pixels in the covariance."""
         at = self.moments(vector).statistics
         for spread in self.chain.spread.deviating():
             change = replace(self.chain, spread=spread).moments(*self.charges(vector)).statistics - at

@@ -55,7 +55,7 @@ TITLES = {
     "dead_fraction": "fraction of dead pixels",
     "qe": "quantum efficiency",
 }
-#: Maps with titles, in the order of the report, and the quantiles of black and white.
+#: Maps with titles, in the order of the report.
 MAPS = {
     "offset_e": "offset",
     "response_fraction": "response",
@@ -64,6 +64,8 @@ MAPS = {
     "rts_probability": "probability of RTS noise",
     "is_defect": "defects",
 }
+#: Number above which there is no decimal point, and quantiles of black and white.
+MANY = 1000.0
 QUANTILES = (0.005, 0.995)
 #: Longest side of the picture of a map, and chi-square per degree of freedom up to which a fit is good.
 MAX_SIDE, GOOD_RATIO = 512, 1.5
@@ -138,7 +140,7 @@ def report_page(twin: Twin) -> str:
 
 def _tables(twin: Twin) -> list[ReportTable]:
     rows = [
-        [TITLES.get(name, name), f"{each.value:.4g}", f"{each.low:.4g} to {each.high:.4g}", unit_of(name), name]
+        [TITLES.get(name, name), _shown(each.value), f"{_shown(each.low)} to {_shown(each.high)}", unit_of(name), name]
         for name, each in twin.estimates.items()
     ]
     tables = [
@@ -152,6 +154,11 @@ def _tables(twin: Twin) -> list[ReportTable]:
             ReportTable(("Not identifiable", "because"), others, "Parameters that the frames do not determine.")
         )
     return tables
+
+
+def _shown(value: float) -> str:
+    """Return a number with four digits, or all before the point."""
+    return f"{value:,.0f}" if abs(value) >= MANY else f"{value:.4g}"
 
 
 def _levels(twin: Twin) -> ReportTable:
@@ -180,5 +187,5 @@ def _maps(twin: Twin) -> Sequence[ReportFigure]:
             255.0 * np.clip((values[::step, ::step] - low) / (high - low), 0.0, 1.0)
         ).astype(np.uint8)
         unit = unit_of(name)
-        figures.append(picture_figure(grey, title, f"{title}: {low:.3g} to {high:.3g} {unit}".rstrip()))
+        figures.append(picture_figure(grey, title, f"{low:.3g} to {high:.3g} {unit}".rstrip()))
     return figures
