@@ -34,6 +34,7 @@ EXTRAS = {
     "scene": {"maps"},
     "studio": {"studio"},
     "tiles": {"video"},
+    "twin": {"maps", "pictures"},
     "video": {"video"},
     "view": {"notebook", "view"},
 }

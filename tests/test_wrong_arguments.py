@@ -90,7 +90,7 @@ RESULTS = {
     "PointSpread", "Ramp", "Rates", "Recording", "Report", "RuleResult", "SamplingSpectrum", "Shot", "SiteColours", "SiteEstimates",
     "EventPixelFit",
     "SiteGraph", "SitePixels", "SiteSignals", "Sites", "SnrTable", "Solution", "Stock", "Summary", "TiledCapture", "Violation",
-    "WrittenLayout",
+    "Estimate", "Twin", "WrittenLayout",
 }  # fmt: skip
 #: Functions of numbers: those of NaN are NaN.
 OF_NUMBERS = {
