@@ -146,6 +146,7 @@ OTHERS = {
     "optics.chief_ray": {"image_height_um": [0.0, 1e4], "angle_deg": [0.0, 20.0]},
     "sensor.pixel_optics": {"kind": "microlens", "height_um": 3.0, "refractive_index": 1.5, "photodiode_inset_um": 0.3},
     "sensor.bits": 10,
+    "sensor.provenance": {"title": "another sensor"},
     "sensor.effects": [{"kind": "ramp of test_worker_cache", "loss": 0.3}],
     "distortion.focal_um": [300.0, 320.0],
     "distortion.centre_um": [3.0, -2.0],
@@ -213,6 +214,8 @@ SECTIONS = {
     ],
     "sensor": [
         SHOT["sensor"] | {"companding": "table", "companding_table": [0.0, 0.4, 0.7, 0.9, 1.0]},
+        {"preset": "imx174"},
+        {"datasheet": "sheet.yaml"},
         {},
     ],
 }
@@ -239,7 +242,7 @@ def leaves(model, section, prefix=""):
     """Yield path, type and value of every setting that a shot can have, including those that it has not."""
     for name, field in model.model_fields.items():
         path, value = prefix + name, section.get(name, field.default if not field.is_required() else None)
-        in_sections = "layout.edits", "sensor.companding_table", "scene.gaze_range_um", *LEVELS
+        in_sections = "layout.edits", "sensor.companding_table", "sensor.datasheet", "scene.gaze_range_um", *LEVELS
         if name in ("kind", "generator") or path in in_sections:
             continue
         if isinstance(value, dict) and own_models(field.annotation) and path not in OTHERS:
@@ -313,6 +316,8 @@ def runner(tmp_path, monkeypatch):
     spot = np.exp(-0.5 * np.square(np.hypot(*np.mgrid[-12:13, -12:13])))
     PSFGrid.from_arrays(spot, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0).write(tmp_path / "psfs.npz")
     np.save(tmp_path / "map.npy", rng.random((24, 24)))
+    sheet = "{pixel_um: '2.25', bits: 12, qe_percent: '91.25', dark_noise_e: '5.560', saturation_e: '9458'}"
+    (tmp_path / "sheet.yaml").write_text(sheet)
     monkeypatch.chdir(tmp_path)
     returned = {}
     part = WorkerCache.part
