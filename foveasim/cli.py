@@ -725,16 +725,20 @@ def twin(
 
     sums = partial_path(out)
     with _progress(folder.name, f"sums of finished stacks are stored in {sums}, {RESUME}") as progress:
-        found = fit(
-            folder,
-            bits=bits,
-            pixel_um=pixel_um,
-            mosaic=cast("Any", mosaic),
-            companding=cast("Any", companding),
-            log_strength=log_strength,
-            resume=sums,
-            progress=progress,
-        )
+        try:
+            found = fit(
+                folder,
+                bits=bits,
+                pixel_um=pixel_um,
+                mosaic=cast("Any", mosaic),
+                companding=cast("Any", companding),
+                log_strength=log_strength,
+                resume=sums,
+                progress=progress,
+            )
+        except FoveasimError:
+            remove_directory(sums)
+            raise
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     paths = [out / "twin.npz", out / "report.html"]

@@ -6,10 +6,13 @@ import pickle
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 from scipy.constants import e as elementary_charge
 from scipy.stats import binom
+from typer.testing import CliRunner
 
 import foveasim as fs
+from foveasim.cli import app
 from foveasim.sensor.effects import RowNoise
 from foveasim.twin.frames.statistics import StackStatistics, sum_frames
 
@@ -146,6 +149,52 @@ def test_photons_give_the_quantum_efficiency():
 
     assert found.estimates["qe"].value == pytest.approx(0.6, rel=0.01)
     assert found.sensor().qe == found.value("qe")
+
+
+def test_dark_current_doubles_with_temperature():
+    """Three temperatures, 8 K apart: the current of the lowest one, and the rise that doubles it."""
+    rng = np.random.default_rng(5)
+
+    def frames(signal_e):
+        charge = rng.poisson(signal_e, (16, N_Y, N_X)) + rng.normal(0.0, 4.0, (16, N_Y, N_X))
+        return np.rint(0.4 * charge + 60.0).astype(np.uint16)
+
+    stacks = [
+        fs.twin.Stack(frames(50.0 * 2.0 ** ((kelvin - 300.0) / 8.0) * time_s), time_s, light=0, temperature_k=kelvin)
+        for kelvin in (300.0, 308.0, 316.0)
+        for time_s in (0.01, 1.0)
+    ]
+    lit = [fs.twin.Stack(frames(900.0 * k + 0.5), 0.01, temperature_k=300.0) for k in range(1, 9)]
+    found = fs.twin.fit([*stacks, *lit], bits=12, pixel_um=3.0)
+
+    assert found.estimates["dark_doubling_k"].value == pytest.approx(8.0, rel=0.03)
+    assert found.estimates["dark_e_per_s"].value == pytest.approx(50.0, rel=0.03)
+    sensor = found.sensor()
+    assert (sensor.temperature_k, sensor.dark_reference_k) == (300.0, 300.0)
+
+
+def test_colours_of_a_mosaic_share_the_electronics():
+    """Levels of red, green and blue differ; gain and noise are those of all, and the top left pixel is red."""
+    rng = np.random.default_rng(6)
+    colour = np.tile([[1.0, 0.7], [0.7, 0.4]], (N_Y // 2, N_X // 2))
+
+    def frames(signal_e, n=16):
+        charge = rng.poisson(signal_e * colour, (n, N_Y, N_X)) + rng.normal(0.0, 4.0, (n, N_Y, N_X))
+        return np.rint(0.4 * charge + 60.0).astype(np.uint16)
+
+    stacks = [fs.twin.Stack(frames(0.0, 32), 1e-3, light=0)]
+    stacks += [fs.twin.Stack(frames(4e5 * time_s), time_s, light=1) for time_s in TIMES_S]
+    found = fs.twin.fit(stacks, bits=12, pixel_um=3.0, mosaic="RGGB")
+
+    for name, value in (("gain_dn_per_e", 0.4), ("read_noise_e", 4.0)):
+        assert found.estimates[name].value == pytest.approx(value, rel=0.02)
+    assert found.estimates["prnu_fraction"].value < 2e-3
+    light_e = {row["class"]: row["light_e"] for row in found.levels if row["stack"] == "stack 10"}
+    np.testing.assert_allclose([light_e[k] for k in range(4)], [8000.0, 5600.0, 5600.0, 3200.0], rtol=0.02)
+    channel = found.layout().channel.reshape(N_Y, N_X)[::-1]  # the top row first
+    np.testing.assert_array_equal(channel[:2, :2], [[0, 1], [1, 2]])
+    assert found.sensor(filters="rgb").n_filters == 3
+    assert any("give filters" in text for text in found.assumptions)
 
 
 def test_quantisation_hides_noise():
@@ -296,6 +345,19 @@ def test_folder_equals_arrays(folder, stacks, tmp_path):
     assert [each.photons for each in listed] == [None, 500.0]
 
 
+def test_png_and_raw_files_are_codes(tmp_path):
+    codes = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
+    Image.fromarray(codes).save(tmp_path / "a.png")
+    mosaic = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, bytes([0, 1, 1, 2]), True)]
+    camera = [(271, "s", 0, "Test", True), (272, "s", 0, "Camera", True), (50706, "B", 4, bytes([1, 4, 0, 0]), True)]
+    tags = [*mosaic, *camera, (50717, "H", 1, 65_535, True)]
+    tifffile.imwrite(tmp_path / "b.dng", codes, photometric=32803, extratags=tags, metadata=None)
+    pytest.importorskip("rawpy")
+
+    for stored in fs.twin.Stack([tmp_path / "a.png", tmp_path / "b.dng"], 0.01, light=0):
+        np.testing.assert_array_equal(stored, codes)
+
+
 def test_interrupted_fit_resumes(folder, tmp_path):
     """Sums of stacks that have been read are used again, without their frames."""
     whole = fs.twin.fit(folder, bits=12, pixel_um=3.0)
@@ -316,12 +378,12 @@ def test_interrupted_fit_resumes(folder, tmp_path):
     [
         ("truncated", "0.tif: is corrupt or truncated"),
         ("sizes", "must have the same size, but dark_1ms has frames of 64 x 48 pixels and 64 x 47 pixels"),
-        ("jpeg", "has been processed or compressed"),
+        ("jpeg", "JPEG files are lossy"),
         ("single", "must be at least two per stack, but dark_1ms has 1"),
-        ("bits", "'bits' must be those of the codes: .* above 8 bits"),
+        ("bits", "'bits' must be those of the codes: flat.* has the code [0-9]*, got 8"),
         ("no dark", "must contain a stack of dark frames"),
         ("no light", "must contain stacks with light"),
-        ("shifted", "its codes are multiples of 16: divide them by it"),
+        ("shifted", "the codes are multiples of 16: divide them by it"),
     ],
 )
 def test_wrong_folders_are_explained(folder, change, message, tmp_path):
@@ -332,9 +394,10 @@ def test_wrong_folders_are_explained(folder, change, message, tmp_path):
     elif change == "sizes":
         tifffile.imwrite(dark / "1.tif", np.zeros((47, 64), np.uint16), photometric="minisblack")
     elif change == "jpeg":
-        first.rename(dark / "0.jpg")
+        first.write_bytes(b"\xff\xd8\xff\xe0" + first.read_bytes())
     elif change == "shifted":
-        tifffile.imwrite(first, 16 * tifffile.imread(dark / "1.tif") + np.uint16(8192), photometric="minisblack")
+        for path in dark.iterdir():
+            tifffile.imwrite(path, 16 * tifffile.imread(path) + np.uint16(8192), photometric="minisblack")
     for path in sorted(dark.iterdir())[1:] if change == "single" else ():
         path.unlink()
     if change in ("no dark", "no light"):
@@ -343,6 +406,27 @@ def test_wrong_folders_are_explained(folder, change, message, tmp_path):
     with pytest.raises(fs.FoveasimError, match=message) as caught:
         fs.twin.fit(folder, bits=bits, pixel_um=3.0)
     assert "\n" not in str(caught.value)
+
+
+def test_bits_are_checked_when_a_fit_resumes(folder, tmp_path):
+    fs.twin.fit(folder, bits=12, pixel_um=3.0, resume=tmp_path / "sums")
+    with pytest.raises(fs.errors.ParameterError, match="'bits' must be those of the codes"):
+        fs.twin.fit(folder, bits=8, pixel_um=3.0, resume=tmp_path / "sums")
+
+
+def test_command_leaves_nothing_after_an_error(folder, tmp_path):
+    found = CliRunner().invoke(
+        app, ["twin", str(folder), "--bits", "8", "--pixel-um", "3", "--out", str(tmp_path / "out")]
+    )
+
+    assert isinstance(found.exception, fs.errors.ParameterError)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames"]
+
+
+def test_temperatures_belong_to_all_stacks(stacks):
+    warm = fs.twin.Stack(stacks[0].frames, 1e-3, light=0, temperature_k=310.0)
+    with pytest.raises(fs.errors.ParameterError, match="'temperature_k' must be given for all stacks, or for none"):
+        fs.twin.fit([warm, *stacks[1:]], bits=12, pixel_um=3.0)
 
 
 def test_clipped_dark_frames_are_reported():

@@ -57,3 +57,11 @@ def read_raw(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
             output_color=rawpy.ColorSpace.sRGB,
         )
     return {}, [picture]
+
+
+def read_mosaic(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Read the codes of a raw file, as on the sensor, in the sandbox process."""
+    rawpy = import_optional(Path(name), "rawpy")
+    with rawpy.imread(name) as raw:
+        check_size(raw.sizes.raw_width, raw.sizes.raw_height)
+        return {}, [np.array(raw.raw_image_visible)]

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from foveasim._core.calls import Limits, OwnCheck
 from foveasim._io.npz import read_archive, write_archive
 from foveasim.errors import FoveasimError, FoveasimWarning, ParameterError, warn
-from foveasim.sensor.adc import BITS, LOG_STRENGTH, Companding
-from foveasim.twin.frames.fitting import StackLight, fit_statistics
+from foveasim.metrics.emva import MAX_UNDERFLOW_FRACTION
+from foveasim.sensor.adc import ADC, BITS, LOG_STRENGTH, Companding
+from foveasim.twin.frames.fitting import fit_statistics
 from foveasim.twin.frames.result import Twin, twin_of
 from foveasim.twin.frames.stacks import Stack, read_stacks
 from foveasim.twin.frames.statistics import StackStatistics, StackSums, sum_frames
@@ -26,8 +27,6 @@ __all__ = ["fit"]
 PIXEL = Limits(above=0.0, low=0.1, at_most=1e3, hint="the side of a pixel, in µm")
 #: Arrays of the sums of a stack.
 SUMS = tuple(each.name for each in fields(StackSums))
-#: Largest fraction of dark codes that are 0 (EMVA 1288).
-MAX_ZERO_FRACTION = 0.005
 
 
 def fit(
@@ -129,6 +128,7 @@ def fit(
         adc["companding_table"] = [float(each) for each in companding_table]
     if len(inl_dn):
         adc["inl_dn"] = [float(each) for each in inl_dn]
+    ADC(bits=bits, **adc)  # checks them before frames are read
     names = [each.name or f"stack {k}" for k, each in enumerate(stacks)]
     statistics = []
     for k, (name, stack) in enumerate(zip(names, stacks, strict=True)):
@@ -140,45 +140,42 @@ def fit(
             )
         if progress is not None:
             progress(k + 1, len(stacks))
-    lights = [StackLight(each.exposure_s, each.light, each.photons, each.temperature_k) for each in stacks]
     known = {"bits": bits, **adc}
-    return twin_of(fit_statistics(statistics, lights, known, mosaic), names, pixel_um, {**known, "mosaic": mosaic})
+    return twin_of(fit_statistics(statistics, stacks, known, mosaic), names, pixel_um, {**known, "mosaic": mosaic})
 
 
 def _statistics(name: str, stack: Stack, bits: int, resume: Path | None) -> StackStatistics:
     """Return the statistics of a stack, from sums that are stored if its files did not change."""
     path = None if resume is None else _sums_path(resume, stack)
-    if path is not None and path.is_file():
-        try:
-            _, arrays = read_archive(path)
-            return StackStatistics.of(StackSums(*(arrays[each] for each in SUMS)))
-        except (FoveasimError, KeyError, ValueError, OSError):
-            path.unlink()
-    total = sum_frames(name, _checked(name, stack, bits))
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        arrays = {each: getattr(total, each) for each in SUMS}
-        write_archive(path, {}, arrays, is_compressed=False)
+    total = None if path is None else _stored(path)
+    if total is None:
+        total = sum_frames(name, stack)
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_archive(path, {}, {each: getattr(total, each) for each in SUMS}, is_compressed=False)
+    _check_codes(name, stack, bits, total)
     return StackStatistics.of(total)
 
 
-def _checked(name: str, stack: Stack, bits: int) -> Iterator[NDArray[Any]]:
-    """Yield the frames of a stack, after comparing their codes with the bits."""
-    n_codes, n_zeros, n_pixels = 2**bits, 0, 0
-    for k, frame in enumerate(stack):
-        if frame.size and frame.max() >= n_codes:
-            shift = next((s for s in range(16, 0, -1) if not np.any(frame.astype(np.int64) % 2**s)), 0)
-            hint = f"; its codes are multiples of {2**shift}: divide them by it" if shift else ""
-            raise ParameterError(
-                "bits",
-                f"must be those of the codes: {name}, frame {k}, has the code {int(frame.max())}, above {bits} bits{hint}",
-            )
-        n_zeros += int(np.count_nonzero(frame == 0))
-        n_pixels += frame.size
-        yield frame
-    if stack.is_dark and n_pixels and n_zeros > MAX_ZERO_FRACTION * n_pixels:
+def _stored(path: Path) -> StackSums | None:
+    """Return stored sums, None if there are none that can be read."""
+    try:
+        return StackSums(**read_archive(path)[1])
+    except (FoveasimError, TypeError, ValueError, OSError, BadZipFile):
+        return None
+
+
+def _check_codes(name: str, stack: Stack, bits: int, total: StackSums) -> None:
+    """Compare the codes of a stack with the bits, and warn of dark codes that are 0."""
+    n_zeros, highest, occurring = total.found.tolist()
+    if highest >= 2**bits:
+        shift = (occurring & -occurring).bit_length() - 1
+        hint = f"the codes are multiples of {2**shift}: divide them by it" if shift else ""
+        raise ParameterError("bits", f"must be those of the codes: {name} has the code {highest}", bits, hint=hint)
+    n_codes = total.sums.size * len(total.rows)
+    if stack.is_dark and n_zeros > MAX_UNDERFLOW_FRACTION * n_codes:
         warn(
-            f"{100.0 * n_zeros / n_pixels:.2g} % of the codes of {name} are 0: the black level is too low, and noise and "
+            f"{100.0 * n_zeros / n_codes:.2g} % of the codes of {name} are 0: the black level is too low, and noise and "
             "offsets are biased; increase the black level of the camera",
             FoveasimWarning,
         )

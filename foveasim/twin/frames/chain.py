@@ -15,12 +15,10 @@ from foveasim._core.validation import Floats
 from foveasim.layout.generators.grid import grid
 from foveasim.sensor import Sensor
 from foveasim.sensor.effects.measured import OffsetMap
-from foveasim.units import ELEMENTARY_CHARGE_C
+from foveasim.sensor.published.datasheet import SWING_V
 
 __all__ = ["Chain", "Spread"]
 
-#: Range of the ADC, V: only its product with the capacitance matters.
-SWING_V = 1.0
 #: Pixels that represent all: a lattice of rank 1, whose responses, offsets and dark currents are equally probable each, and the
 #: steps of the lattice with the smallest correlations.
 N_PIXELS, LATTICE = 31, (1, 22, 10)
@@ -121,7 +119,7 @@ class Chain:
     def parameters(self, values: Mapping[str, float]) -> dict[str, Any]:
         """Return parameters of a sensor for those of a fit."""
         return dict(self.known) | {
-            "capacitance_f": self.n_codes * ELEMENTARY_CHARGE_C / (values["gain_dn_per_e"] * SWING_V),
+            "gain_dn_per_e": values["gain_dn_per_e"],
             "v_sat_v": SWING_V,
             "pedestal_v": SWING_V * max(values["black_level_dn"] + 0.5, 0.0) / self.n_codes,
             "read_noise_e": math.sqrt(max(values["read_noise_e2"], 0.0)),

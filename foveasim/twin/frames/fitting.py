@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -12,16 +12,18 @@ from scipy.special import ndtri
 
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.errors import ParameterError
+from foveasim.metrics.photon_transfer import MIN_DARK_DN2
 from foveasim.sensor.adc import ADC, QUANTISATION_DN2
 from foveasim.twin.frames.chain import Chain, Spread
 from foveasim.twin.frames.dark_current import DarkSpread, fit_dark_spread
 from foveasim.twin.frames.intervals import Estimate, Uncertain, of_fraction, of_mean, of_squares, of_variance
 from foveasim.twin.frames.levels import Levels, block_means, class_index
 from foveasim.twin.frames.pooled import Exposures, PooledFit, fit_levels
+from foveasim.twin.frames.stacks import Stack
 from foveasim.twin.frames.statistics import StackStatistics
-from foveasim.twin.frames.telegraph import TelegraphFit, fit_telegraph
+from foveasim.twin.frames.telegraph import MIN_FRAMES, TelegraphFit, fit_telegraph
 
-__all__ = ["StackLight", "fit_statistics"]
+__all__ = ["Fitted", "fit_statistics"]
 
 #: Fraction of the variance that shot noise would have, below which a level is close to the full well, and at which it is full.
 SATURATING, FULL = 0.6, 0.15
@@ -31,8 +33,6 @@ LINEAR_FRACTION = 0.8
 DEAD_RESPONSE, HOT_PROBABILITY = 0.5, 0.01
 #: Standard error of the nonlinearity up to which it is fitted.
 MAX_NONLINEARITY_ERROR = 0.1
-#: Dark variance below which quantisation hides noise (EMVA 1288), DN².
-MIN_DARK_DN2 = 0.24
 #: Rounds of the fit, with what differs between pixels from the round before.
 ROUNDS = 3
 #: Fraction of the full well above which the first fit leaves out levels.
@@ -41,51 +41,26 @@ CLOSE_FRACTION = 0.85
 ADC_NAMES = ("companding", "log_strength", "companding_table", "inl_dn")
 
 
-@dataclass(frozen=True)
-class StackLight:
-    """
-    Exposure of a stack.
-
-    ``exposure_s``; ``photons``: photons of a pixel, or None; ``light``: relative light, 0 in the dark, or None if unknown;
-    ``temperature_k``, or None.
-    """
-
-    exposure_s: float
-    light: float | None = None
-    photons: float | None = None
-    temperature_k: float | None = None
-
-    @property
-    def is_dark(self) -> bool:
-        """Whether there is no light."""
-        return self.light == 0.0 or self.photons == 0.0
-
-
 @dataclass(eq=False)
 class Fitted:
     """
     Result of :func:`fit_statistics`.
 
     ``estimates``: parameters with intervals, or why they are not identifiable. ``maps``: (n_y, n_x) by name. ``levels``,
-    ``fit``: statistics and chain. ``assumptions``: what was taken as known. ``classes`` (n_y, n_x): class of each pixel, -1 for
-    defects.
+    ``fit``: statistics and chain. ``assumptions``: what was taken as known. ``temperature_k``: of the dark current, or None.
     """
 
     estimates: dict[str, Estimate | Uncertain]
     maps: dict[str, Floats]
     levels: Levels
     fit: PooledFit
-    chain: Chain
     assumptions: list[str]
-    classes: Ints
-    is_used: Bools
-    telegraph: TelegraphFit | None = None
-    values: dict[str, float] = field(default_factory=dict)
+    temperature_k: float | None
 
 
 def fit_statistics(
     statistics: Sequence[StackStatistics],
-    lights: Sequence[StackLight],
+    stacks: Sequence[Stack],
     known: Mapping[str, Any],
     mosaic: str | None = None,
 ) -> Fitted:
@@ -96,7 +71,7 @@ def fit_statistics(
 
     Raises ParameterError when there are no dark stacks, no stacks with light, or the stacks do not differ.
     """
-    return _Fit(list(statistics), list(lights), dict(known), mosaic).run()
+    return _Fit(list(statistics), list(stacks), dict(known), mosaic).run()
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +94,7 @@ class _Fit:
     """The steps of a fit, which share statistics and results so far."""
 
     def __init__(
-        self, statistics: list[StackStatistics], lights: list[StackLight], known: dict[str, Any], mosaic: str | None
+        self, statistics: list[StackStatistics], lights: list[Stack], known: dict[str, Any], mosaic: str | None
     ) -> None:
         self.statistics, self.lights, self.known = statistics, lights, known
         self.dark = [k for k, each in enumerate(lights) if each.is_dark]
@@ -128,6 +103,8 @@ class _Fit:
             raise ParameterError("frames", "must contain a stack of dark frames: light=0, lens covered")
         if not self.lit:
             raise ParameterError("frames", "must contain stacks with light: the gain follows from their shot noise")
+        if len({each.temperature_k is None for each in lights}) > 1:
+            raise ParameterError("temperature_k", "must be given for all stacks, or for none")
         self.classes = class_index(*statistics[0].shape, mosaic)
         self.n_classes = int(self.classes.max()) + 1
         self.adc = ADC(bits=known["bits"], **{name: known[name] for name in ADC_NAMES if name in known})
@@ -156,10 +133,9 @@ class _Fit:
                 break
         assert fit is not None
         self._report(fit)
-        return Fitted(
-            self.estimates, self.maps, self.levels, fit, self.chain, self.assumptions, self.classes, self.is_used,
-            self.telegraph, self.values,
-        )  # fmt: skip
+        temperatures = [each.temperature_k for each in self.lights if each.temperature_k is not None]
+        lowest_k = min(temperatures, default=None)
+        return Fitted(self.estimates, self.maps, self.levels, fit, self.assumptions, lowest_k)
 
     def _linear(self, each: StackStatistics) -> StackStatistics:
         """Return means and variances in linear codes, for what differs between pixels."""
@@ -454,11 +430,10 @@ class _Fit:
             slope = 1.0 - bend * float(fit.light_e[k])
             signal = gain * slope * float(fit.light_e[k])
             weight = signal**2 * stack.n_frames / max(float(stack.variance_dn2[own].mean()), 1e-6)
-            ratio = slope
-            relative = (stack.mean_dn - float(stack.mean_dn[own].mean()) - ratio * self.offset_dn) / signal
+            relative = (stack.mean_dn - float(stack.mean_dn[own].mean()) - slope * self.offset_dn) / signal
             response[own] += weight * relative[own]
             response_noise[own] += weight**2 * (stack.variance_dn2[own] / stack.n_frames) / signal**2
-            of_offset[own] += weight * ratio / signal
+            of_offset[own] += weight * slope / signal
             total[own] += weight
         has = total > 0.0
         total = np.where(has, total, 1.0)
@@ -533,13 +508,11 @@ class _Fit:
         squares = self._block_means(left**2 * scale - noise)
         weights = self.levels.weights
         per_class = (squares @ weights).mean()
-        mean_noise = float(noise[good].mean())
         pixel_square = float((left**2).sum()) / max(degrees, 1)
         found: dict[str, tuple[float, Any]] = {"pixel": (float(per_class), squares.mean(axis=0))}
         for name, means, n in (("row", row, n_x), ("column", column, n_y)):
             square, other = n * float(means.var(ddof=1)), pixel_square + (0.0 if lines is None else lines[name])
             found[name] = ((square - other) / n, (square, means.size - 1, other, n))
-        del mean_noise
         return found
 
     # -- results ----------------------------------------------------------------------------------------------------
@@ -571,6 +544,10 @@ class _Fit:
             found["full_well_e"] = Uncertain(
                 f"no level is limited by it: the codes end at {top:.4g} e-, or the levels are too low"
             )
+        if self.n_classes > 1:
+            self.assumptions.append(
+                "Colours have a response of their own, which is no part of sensor(): give filters and quantum efficiency."
+            )
         for name in fit.names:
             if name.startswith(("qe", "dark_doubling_k")):
                 found[name] = of_mean(values[name], fit.error(name), blocks, is_log=True)
@@ -581,7 +558,6 @@ class _Fit:
         if isinstance(found["read_noise_e"], Uncertain):
             names = ("dsnu_e", "dsnu_row_e", "dsnu_column_e", "row_noise_e", "column_noise_e", "rts_fraction", "rts_e")
             found |= dict.fromkeys(names, found["read_noise_e"])
-        self.values = dict(values)
         self._report_maps()
 
     def _report_maps(self) -> None:
@@ -645,14 +621,14 @@ class _Fit:
         found["dead_fraction"] = of_fraction(int(self.is_dead.sum()), n)
         if self.telegraph is None:
             reason = "no pixels have variances that one distribution does not explain"
-            if self.statistics[self.telegraph_stack].n_frames < 4:
+            if self.statistics[self.telegraph_stack].n_frames < MIN_FRAMES:
                 reason = "it needs four dark frames of one exposure time"
             found["rts_fraction"] = found["rts_e"] = Uncertain(reason)
             return
         each = self.telegraph
         odds = math.log(each.fraction / (1.0 - each.fraction))
-        limits = [1.0 / (1.0 + math.exp(-(odds + s * each.log_odds_error * 1.96))) for s in (-1, 1)]
-        found["rts_fraction"] = Estimate(each.fraction, *limits)
+        limits = of_mean(odds, each.log_odds_error)[1:]
+        found["rts_fraction"] = Estimate(each.fraction, *(1.0 / (1.0 + math.exp(-limit)) for limit in limits))
         gain_error = fit.error("gain_dn_per_e")
         found["rts_e"] = of_mean(
             each.step_dn / self.dark_slope, math.hypot(each.log_step_error, gain_error), is_log=True
@@ -700,16 +676,7 @@ def _error(of_blocks: Floats, weights: Floats) -> float:
 
 def _selected(levels: Levels, index: Ints) -> Levels:
     """Return some of the levels."""
-    names = (
-        "stack",
-        "class_of_level",
-        "n_frames",
-        "n_pixels",
-        "means_dn",
-        "variances_dn2",
-        "column_dn2",
-        "mean_noise_dn2",
-    )
+    names = (each.name for each in fields(Levels) if each.name != "weights")
     return replace(levels, **{name: getattr(levels, name)[index] for name in names})
 
 

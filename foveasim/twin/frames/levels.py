@@ -9,9 +9,12 @@ import numpy as np
 
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints
-from foveasim.twin.frames.statistics import MAX_BLOCKS, StackStatistics
+from foveasim.twin.frames.statistics import StackStatistics
 
 __all__ = ["Levels", "block_means", "block_weights", "class_index", "row_blocks"]
+
+#: Largest number of blocks of rows, whose differences give the uncertainty of statistics.
+MAX_BLOCKS = 64
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,28 +22,18 @@ from foveasim.layout.generators.grid import grid
 from foveasim.layout.readout import readout_by
 from foveasim.sensor import Sensor
 from foveasim.sensor.effects.measured import ColumnNoise, OffsetMap, ResponseMap, RowNoise, TelegraphMap
-from foveasim.twin.frames.chain import SWING_V
+from foveasim.sensor.published.datasheet import SWING_V
 from foveasim.twin.frames.intervals import Estimate, Uncertain
-from foveasim.units import ELEMENTARY_CHARGE_C
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from foveasim.twin.frames.fitting import Fitted
+
 __all__ = ["Twin", "read_twin"]
 
 FILE_FORMAT, FILE_VERSION = "foveasim twin", 1
-#: Parameters of a sensor that a twin gives as they are, and those that are proportional to the area of a site.
-EQUAL = (
-    "prnu_fraction",
-    "dsnu_fraction",
-    "hot_fraction",
-    "dead_fraction",
-    "rts_fraction",
-    "rts_e",
-    "nonlinearity_fraction",
-)
-OF_AREA = ("dark_e_per_s", "hot_e_per_s", "full_well_e")
-#: Limit of 95 % intervals above which noise of lines is part of the sensor.
+#: Probability of RTS noise above which a pixel has it.
 MIN_PROBABILITY = 0.5
 
 
@@ -73,6 +63,8 @@ class Twin:
         Parameters that were given: bits, mosaic, and those of the ADC.
     n_fitted : int
         Number of parameters of the chain, and of levels of unknown light, that were fitted.
+    temperature_k : float, K, optional
+        Temperature of the dark current, if it was given: the lowest one.
     """
 
     estimates: Mapping[str, Estimate]
@@ -83,6 +75,7 @@ class Twin:
     pixel_um: float
     known: Mapping[str, Any]
     n_fitted: int
+    temperature_k: float | None = None
 
     def __repr__(self) -> str:
         n_y, n_x = next(iter(self.maps.values())).shape
@@ -194,7 +187,7 @@ class Twin:
         found: dict[str, Any] = {name: value for name, value in self.known.items() if name != "mosaic"}
         found |= {
             "v_sat_v": SWING_V,
-            "capacitance_f": n_codes * ELEMENTARY_CHARGE_C / (self.value("gain_dn_per_e") * SWING_V) * scale,
+            "gain_dn_per_e": self.value("gain_dn_per_e") / scale,
             "pedestal_v": SWING_V * (self.value("black_level_dn") + 0.5) / n_codes,
             "read_noise_e": self.value("read_noise_e"),
             "nonlinearity_fraction": self.value("nonlinearity_fraction"),
@@ -203,43 +196,47 @@ class Twin:
             found["qe"] = min(self.value("qe"), 1.0)
         if "full_well_e" in self.estimates:
             found["full_well_e"] = self.value("full_well_e") * scale
+        if self.temperature_k is not None:
+            found["temperature_k"] = found["dark_reference_k"] = self.temperature_k
         if "dark_doubling_k" in self.estimates:
             found["dark_doubling_k"] = self.value("dark_doubling_k")
-        found |= self._maps_of_sites() if own else self._statistics(sites, scale)
+        found |= self._maps_of_sites(sites) if own else self._statistics(sites, scale)
         return Sensor(sites, **(found | parameters))
 
     def _statistics(self, sites: Layout, scale: Floats | float) -> dict[str, Any]:
         """Return the parameters of sensors of the same kind."""
-        names = ("prnu_fraction", "dsnu_fraction", "hot_fraction", "dead_fraction", "rts_fraction", "rts_e")
+        names = (
+            "prnu_fraction", "dsnu_e", "dsnu_fraction", "hot_fraction", "hot_e_per_s", "dead_fraction", "rts_fraction",
+            "rts_e",
+        )  # fmt: skip
         found: dict[str, Any] = {name: self.value(name) for name in names if name in self.estimates}
         if "dark_e_per_s" in self.estimates:
             found["dark_e_per_s"] = max(self.value("dark_e_per_s"), 0.0) * scale
-        if "hot_e_per_s" in self.estimates:
-            found["hot_e_per_s"] = self.value("hot_e_per_s")
-        n_codes, gain = 2 ** int(self.known["bits"]), self.value("gain_dn_per_e")
-        found["pixel_fpn_fraction"] = self.value("dsnu_e") * gain / n_codes
         if "readout_line" in sites.columns:
-            found["line_fpn_fraction"] = self.value("dsnu_column_e") * gain / n_codes
-        return found
+            n_codes = 2 ** int(self.known["bits"])
+            found["line_fpn_fraction"] = self.value("dsnu_column_e") * self.value("gain_dn_per_e") / n_codes
+        return found | {"effects": self._noise_of_lines(sites)}
 
-    def _maps_of_sites(self) -> dict[str, Any]:
+    def _noise_of_lines(self, sites: Layout) -> list[Any]:
+        """Return the temporal noise of rows and columns, for layouts that have them."""
+        kinds = {"row": RowNoise, "column": ColumnNoise}
+        found = {name: self.estimates.get(f"{name}_noise_e") for name in kinds if name in sites.columns}
+        return [kinds[name](each.value) for name, each in found.items() if each is not None and each.low > 0.0]
+
+    def _maps_of_sites(self, sites: Layout) -> dict[str, Any]:
         """Return the parameters of this device for its sites: the last row of frames first."""
 
         def of_sites(name: str) -> Floats:
             return np.ascontiguousarray(self.maps[name][::-1]).ravel()
 
         effects: list[Any] = [ResponseMap(of_sites("response_fraction")), OffsetMap(of_sites("offset_e"))]
-        found: dict[str, Any] = {"effects": effects}
+        found: dict[str, Any] = {}
         if "dark_e_per_s" in self.maps:
             found["dark_e_per_s"] = np.maximum(of_sites("dark_e_per_s"), 0.0)
         if "rts_probability" in self.maps:
             steps = np.where(of_sites("rts_probability") > MIN_PROBABILITY, self.value("rts_e"), 0.0)
             effects.append(TelegraphMap(steps))
-        for name, kind in (("row_noise_e", RowNoise), ("column_noise_e", ColumnNoise)):
-            each = self.estimates.get(name)
-            if each is not None and each.low > 0.0:
-                effects.append(kind(each.value))
-        return found
+        return found | {"effects": effects + self._noise_of_lines(sites)}
 
     def save(self, path: str | Path) -> None:
         """
@@ -260,6 +257,7 @@ class Twin:
             "pixel_um": self.pixel_um,
             "known": dict(self.known),
             "n_fitted": self.n_fitted,
+            "temperature_k": self.temperature_k,
         }
         write_archive(path, about, dict(self.maps))
 
@@ -287,10 +285,11 @@ def read_twin(path: str | Path) -> Twin:
             float(about["pixel_um"]),
             MappingProxyType(about["known"]),
             int(about["n_fitted"]),
+            None if about["temperature_k"] is None else float(about["temperature_k"]),
         )
 
 
-def twin_of(fitted: Any, names: list[str], pixel_um: float, known: Mapping[str, Any]) -> Twin:
+def twin_of(fitted: Fitted, names: list[str], pixel_um: float, known: Mapping[str, Any]) -> Twin:
     """Return the twin of fitted statistics, of stacks with these names."""
     fit, levels = fitted.fit, fitted.levels
     n = levels.mean_dn.size
@@ -321,4 +320,5 @@ def twin_of(fitted: Any, names: list[str], pixel_um: float, known: Mapping[str, 
         pixel_um,
         MappingProxyType(dict(known)),
         len(fit.names),
+        fitted.temperature_k,
     )

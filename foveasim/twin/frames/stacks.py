@@ -12,26 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.calls import Limits, OwnCheck, check_declared
-from foveasim._core.extras import import_optional
-from foveasim._io.formats import as_file_error
-from foveasim._io.images._tiff import pixels_of_page
-from foveasim._io.rasters.fits import open_fits, read_image
-from foveasim._io.rasters.tiff import check_page
 from foveasim.errors import FileError, ParameterError
-from foveasim.maps._npy import read_npy
 from foveasim.sensor.limits import EXPOSURE, TEMPERATURE
+from foveasim.twin.frame_files import stored_frames
 
 __all__ = ["Stack", "read_stacks"]
 
 LIGHT = Limits(at_least=0.0, at_most=1e12, hint="0 is dark; other values are relative, such as 1 for a constant lamp")
-#: Extensions of frames by their readers, and those of files that have lost what a fit needs.
-NPY, TIFF, FITS, RAW = (
-    (".npy",),
-    (".tif", ".tiff"),
-    (".fits", ".fit", ".fts"),
-    (".dng", ".cr2", ".nef", ".arw", ".raf", ".rw2"),
-)
-PROCESSED = (".jpg", ".jpeg", ".webp", ".heic", ".avif", ".gif", ".bmp", ".png")
 #: Names of directories of stacks: dark_10ms, flat-2.5ms.
 STACK_NAME = re.compile(r"(dark|flat)[ _-]*(\d+(?:\.\d+)?)[ _-]*(us|ms|s)(?:[ _-].*)?", re.IGNORECASE)
 SECONDS = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
@@ -45,8 +32,9 @@ class Stack:
     Parameters
     ----------
     frames : (n_frame, n_y, n_x) array, or a sequence of (n_y, n_x) arrays or of files
-        Raw codes of at least two frames, the top row of the upright picture first. Files are ``.npy``, TIFF, FITS or raw files
-        of cameras (with ``rawpy``), of one or several frames, and are read one after the other.
+        Raw codes of at least two frames, the top row of the upright picture first. Files are ``.npy``, TIFF, PNG, FITS (bottom
+        row first, unless ``ROWORDER`` says otherwise) or raw files of cameras (extra ``pictures``), of one or several frames,
+        and are read one after the other.
     exposure_s : float, s
     light : float, optional
         Relative irradiance, which is equal for all stacks with the same number: 0 in the dark, 1 for a constant lamp. None if
@@ -102,64 +90,10 @@ class Stack:
             )
         for each in self.frames:
             if isinstance(each, str | Path):
-                yield from read_frames(Path(each))
+                frames, first_row = stored_frames(Path(each))
+                yield from (frame if first_row == "top" else frame[::-1] for frame in frames)
             else:
                 yield np.asarray(each)
-
-
-def read_frames(path: Path) -> Iterator[NDArray[Any]]:
-    """
-    Yield the frames of a file, (n_y, n_x) codes each, the top row first.
-
-    Raises FileError when the file is no raw frame, or is corrupt.
-    """
-    suffix = path.suffix.lower()
-    if suffix in PROCESSED:
-        raise FileError(
-            path, "has been processed or compressed, which changes its noise; use raw frames: TIFF, FITS, npy or DNG"
-        )
-    readers = {
-        **dict.fromkeys(NPY, _npy),
-        **dict.fromkeys(TIFF, _tiff),
-        **dict.fromkeys(FITS, _fits),
-        **dict.fromkeys(RAW, _raw),
-    }
-    if suffix not in readers:
-        raise FileError(path, f"must be one of {', '.join(readers)}")
-    if not path.is_file():
-        raise FileError(path, "no such file")
-    with as_file_error(path, "frames"):
-        yield from readers[suffix](path)
-
-
-def _npy(path: Path) -> Iterator[NDArray[Any]]:
-    codes = read_npy(path, None).data
-    yield from codes if codes.ndim == 3 else [codes]
-
-
-def _tiff(path: Path) -> Iterator[NDArray[Any]]:
-    import tifffile
-
-    with tifffile.TiffFile(path) as file:
-        for page in file.pages:
-            is_top_first = check_page(page)
-            codes = pixels_of_page(path, page)
-            yield codes if is_top_first else codes[::-1]
-
-
-def _fits(path: Path) -> Iterator[NDArray[Any]]:
-    with open_fits(path) as hdus:
-        for hdu in hdus:
-            if hdu.header.get("NAXIS", 0) >= 2:
-                codes = read_image(hdu, path.stat().st_size)
-                is_top_first = str(hdu.header.get("ROWORDER", "")).strip().upper() == "TOP-DOWN"
-                yield from (each if is_top_first else each[::-1] for each in codes.reshape(-1, *codes.shape[-2:]))
-
-
-def _raw(path: Path) -> Iterator[NDArray[Any]]:
-    rawpy = import_optional(path, "rawpy")
-    with rawpy.imread(str(path)) as raw:
-        yield np.array(raw.raw_image_visible)
 
 
 def read_stacks(folder: str | Path) -> list[Stack]:

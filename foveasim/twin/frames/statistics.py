@@ -21,8 +21,6 @@ from foveasim.errors import ParameterError
 
 __all__ = ["StackStatistics", "StackSums", "sum_frames"]
 
-#: Largest number of blocks of rows, whose differences give the uncertainty of statistics.
-MAX_BLOCKS = 64
 #: Probability of a difference between frames below which it is real, such as flicker of the light.
 MAX_PROBABILITY = 1e-3
 #: Number of columns above which the mean of a row is subtracted from its pixels.
@@ -37,7 +35,7 @@ class StackSums:
     Sums over the frames of a stack.
 
     ``sums``, ``squares``, ``products`` (n_y, n_x) int64: of codes, and with the sum of the row. ``rows`` (n_frame, n_y),
-    ``columns`` (n_frame, n_x): sums of lines.
+    ``columns`` (n_frame, n_x): sums of lines. ``found`` (3,): number of zeros, highest code, and bits that occur.
     """
 
     sums: Ints
@@ -45,6 +43,7 @@ class StackSums:
     products: Ints
     rows: Ints
     columns: Ints
+    found: Ints
 
 
 def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
@@ -62,10 +61,10 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
     rows, columns = [], []
 
     def add() -> None:
-        codes = np.ascontiguousarray(np.stack(batch))
+        codes = np.stack(batch)
         assert total is not None
         of_rows, of_columns = (np.zeros((len(batch), n), np.int64) for n in codes.shape[1:])
-        _kernels.add_frames(codes, total.sums, total.squares, total.products, of_rows, of_columns)
+        _kernels.add_frames(codes, total.sums, total.squares, total.products, of_rows, of_columns, total.found)
         rows.append(of_rows)
         columns.append(of_columns)
         batch.clear()
@@ -74,7 +73,7 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
         codes = check_frame(f"{name}, frame {k}", frame)
         if total is None:
             zeros = np.zeros(codes.shape, np.int64)
-            total = StackSums(zeros, zeros.copy(), zeros.copy(), zeros[:0], zeros[:0])
+            total = StackSums(zeros, zeros.copy(), zeros.copy(), zeros[:0], zeros[:0], np.zeros(3, np.int64))
         elif codes.shape != total.sums.shape:
             raise ParameterError(
                 "frames",

@@ -11,28 +11,21 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.names import missing_path
 from foveasim._core.validation import Floats, Ints, as_any_array, as_numbers, finite_array
-from foveasim._io.formats import FormatError
-from foveasim._io.images import TIFF_EXTENSIONS, read_picture
-from foveasim._io.rasters.fits import open_fits, read_image, select_image
 from foveasim.camera import Camera
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.layout.rows import site_rows
-from foveasim.maps._npy import read_npy
+from foveasim.twin.frame_files import FirstRow, stored_frames
 from foveasim.twin.pictures._target_scenes import undistorted
 
-__all__ = ["FirstRow", "Raster", "check_unsaturated"]
+__all__ = ["Raster", "check_unsaturated"]
 
-FirstRow = Literal["top", "bottom"]
-FITS_EXTENSIONS = (".fits", ".fit")
-JPEG_MAGIC = b"\xff\xd8\xff"
 #: Largest fraction of the highest code in a patch: hot pixels of real sensors are fewer.
 MAX_SATURATED_FRACTION = 1e-3
 #: Part of the side of a patch between corners that is measured, around its centre.
@@ -207,44 +200,13 @@ def _pictures(name: str, frames: Any, first_row: FirstRow | None) -> tuple[NDArr
     """Return numbers (n_frame, n_y, n_x), top row first, and the first row given."""
     usual: FirstRow = "top"
     if isinstance(frames, str | os.PathLike):
-        frames, usual = _read(Path(frames))
+        stored, usual = stored_frames(Path(frames))
+        frames = list(stored)
+        if len(shapes := {frame.shape for frame in frames}) > 1:
+            raise ParameterError(name, "must have the same size", sorted(shapes))
     pictures = as_numbers(name, as_any_array(name, frames), keep_type=True)
     if pictures.ndim not in (2, 3) or 0 in pictures.shape or pictures.dtype.kind not in "uif":
         raise ParameterError(name, "must be codes of the shape (n_frame, n_y, n_x) or (n_y, n_x)", pictures.shape)
     pictures = pictures.reshape(-1, *pictures.shape[-2:])
     order = first_row or usual
     return (pictures if order == "top" else pictures[:, ::-1]), order
-
-
-def _read(path: Path) -> tuple[NDArray[Any], FirstRow]:
-    """Return the stored numbers of a file, and which row is first in files of its format."""
-    suffix = path.suffix.lower()
-    if not path.is_file():
-        raise FileError(path, missing_path(path))
-    with path.open("rb") as file:
-        is_jpeg = file.read(len(JPEG_MAGIC)) == JPEG_MAGIC
-    if is_jpeg or suffix not in (*TIFF_EXTENSIONS, *FITS_EXTENSIONS, ".png", ".npy"):
-        raise FileError(
-            path,
-            "must be a TIFF, PNG, npy or FITS file with the codes of the sensor: JPEG files are lossy, and raw files are "
-            "demosaiced when they are read; convert raw files without demosaicing",
-        )
-    try:
-        if suffix == ".npy":
-            return read_npy(path, None).data, "top"
-        if suffix in FITS_EXTENSIONS:
-            with open_fits(path) as file:
-                hdu = select_image(file, None, "the frames")
-                is_top = str(hdu.header.get("ROWORDER", "")).strip().upper() == "TOP-DOWN"
-                return read_image(hdu, path.stat().st_size), "top" if is_top else "bottom"
-        pixels = read_picture(path)
-    except FileError:
-        raise
-    except FormatError as error:
-        raise FileError(path, str(error)) from None
-    except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on corrupt files
-        problem = " ".join(str(error).split()) or type(error).__name__
-        raise FileError(path, f"is corrupt or truncated ({problem})") from None
-    if pixels.ndim != 2:
-        raise FileError(path, f"must have one channel, the codes of the mosaic, got {pixels.shape[2]} channels")
-    return pixels, "top"

@@ -29,8 +29,9 @@ from foveasim.scene._illuminants import Illuminant
 from foveasim.scene._scene import DISTANCE
 from foveasim.scene.charts import PATCH_NAMES, patch_reflectance
 from foveasim.sensor.limits import EXPOSURE
+from foveasim.twin.frame_files import FirstRow
 from foveasim.twin.pictures._deviations import SPATIAL, Deviation, DeviationTable, Pair, has_sites
-from foveasim.twin.pictures._frames import FirstRow, Raster, check_unsaturated
+from foveasim.twin.pictures._frames import Raster, check_unsaturated
 from foveasim.twin.pictures._target_scenes import WAVES_NM, axis_um, check_slanted, edge_rates, painted_rates, white_of
 
 if TYPE_CHECKING:
