@@ -37,6 +37,10 @@ MAX_NONLINEARITY_ERROR = 0.1
 ROUNDS = 3
 #: Fraction of the full well above which the first fit leaves out levels.
 CLOSE_FRACTION = 0.85
+#: Probability of RTS noise from which a pixel is left out of offsets.
+MAX_RTS = 0.5
+#: Charges of the response by which the signals of hot pixels become charges.
+N_CHARGES = 400
 #: ADC parameters of a sensor that a fit has to know.
 ADC_NAMES = ("companding", "log_strength", "companding_table", "inl_dn")
 
@@ -116,7 +120,6 @@ class _Fit:
         self.estimates: dict[str, Estimate | Uncertain] = {}
         self.maps: dict[str, Floats] = {}
         self.telegraph: TelegraphFit | None = None
-        self.step_dn = 0.0
         self.is_used: Bools = np.zeros(0, np.bool_)
 
     # -- steps ------------------------------------------------------------------------------------------------------
@@ -201,12 +204,9 @@ class _Fit:
         self.rts_probability = np.zeros(stack.shape)
         if np.median(stack.variance_dn2) < MIN_DARK_DN2:
             return
-        self.telegraph = fit_telegraph(self.linear[self.telegraph_stack].variance_dn2[self.good], stack.n_frames)
+        self.telegraph = fit_telegraph(stack.variance_dn2[self.good], stack.n_frames)
         if self.telegraph is not None:
             self.rts_probability[self.good] = self.telegraph.probability
-            self.step_dn = self.telegraph.step_dn
-            middle = float(np.median(stack.mean_dn))
-            self.dark_code_slope = 1.0 / float(self.adc.width_of_code_dn(middle))
 
     def _fit_chain(self, spread: Spread, before: PooledFit | None) -> PooledFit:
         """
@@ -292,17 +292,11 @@ class _Fit:
         for k, (stack, c) in enumerate(zip(levels.stack.tolist(), levels.class_of_level.tolist(), strict=True)):
             own = self.classes == c
             if stack == self.telegraph_stack:
-                linear_dn2 = self.linear[stack].variance_dn2[own]
-                scale = float(levels.column_dn2[k] + variances[k] @ levels.weights) / float(
-                    np.average(linear_dn2, weights=1.0 - p[own])
-                )
-                variances[k] += scale * self.telegraph.noise_dn2 - float(
-                    levels.column_dn2[k] + variances[k] @ levels.weights
-                )
-                errors[k] = scale * self.telegraph.noise_error_dn2
+                variances[k] += self.telegraph.noise_dn2 - float(levels.column_dn2[k] + variances[k] @ levels.weights)
+                errors[k] = self.telegraph.noise_error_dn2
             else:
                 missed = float((p[own] * (1.0 - p[own])).sum() / (1.0 - p[own]).sum())
-                variances[k] -= missed * 0.25 * (self.step_dn * self.dark_code_slope * ratios[k]) ** 2
+                variances[k] -= missed * 0.25 * (self.telegraph.step_dn * ratios[k]) ** 2
         return replace(levels, variances_dn2=variances), errors
 
     def _slope_ratios(self, levels: Levels, before: PooledFit | None) -> Floats:
@@ -313,10 +307,6 @@ class _Fit:
             slopes[self.is_used] = before.slopes_dn_per_e
             slopes[~self.is_used] = 0.0
         return np.asarray(slopes / slopes[levels.stack == self.telegraph_stack][0])
-
-    def _block_means(self, values: Floats) -> Floats:
-        """Return the means of values of pixels over blocks, (n_class, n_block)."""
-        return block_means(values, self.classes)
 
     def _temperatures(self, stacks: Sequence[int]) -> int:
         return len({self.lights[k].temperature_k for k in stacks})
@@ -458,7 +448,7 @@ class _Fit:
             (
                 0.5 * _error(of_blocks, weights) / prnu2 if has_response else 0.0,
                 min(offset_error, 1.0),
-                0.0 if dark is None else dark.log_error,
+                0.0 if dark is None else dark.relative_error,
             ),
         )
 
@@ -466,8 +456,15 @@ class _Fit:
         """Return the distribution of the dark current over pixels, in e-/s."""
         if self.dark_slope_dn is None or self.dark_slope_noise is None:
             return None
-        gain = self.dark_slope
-        return fit_dark_spread(self.dark_slope_dn[self.good] / gain, self.dark_slope_noise[self.good] / gain**2)
+        gain, good = self.dark_slope, self.good
+        # Noise of rows is common to their pixels, and not in the variances.
+        clean = np.where(good, self.dark_slope_dn, 0.0)
+        in_row = good.sum(axis=1, keepdims=True)
+        off = (self.dark_slope_dn - clean.sum(axis=1, keepdims=True) / np.maximum(in_row, 1)) * np.sqrt(
+            in_row / np.maximum(in_row - 1, 1)
+        )
+        slopes = off[good] + clean.sum() / good.sum()
+        return fit_dark_spread(slopes / gain, self.dark_slope_noise[good] / gain**2)
 
     def _centred(self, values: Floats) -> Floats:
         """Return values less the mean of each class."""
@@ -497,7 +494,7 @@ class _Fit:
 
         Each with what its interval needs: mean squares and degrees of freedom of rows and columns, block means of pixels.
         """
-        good = self.good
+        good = self.good & (self.rts_probability < MAX_RTS)  # a mean code of two states is not that of the mean
         n_y, n_x = values.shape
         in_row, in_column = np.maximum(good.sum(axis=1), 1), np.maximum(good.sum(axis=0), 1)
         clean = np.where(good, values, 0.0)
@@ -505,7 +502,7 @@ class _Fit:
         left = np.where(good, clean - row[:, None] - column + clean.sum() / good.sum(), 0.0)
         degrees = good.sum() - n_y - n_x + 1
         scale = good.sum() / max(degrees, 1)
-        squares = self._block_means(left**2 * scale - noise)
+        squares = block_means(left**2 * scale - noise, np.where(good, self.classes, -1))
         weights = self.levels.weights
         per_class = (squares @ weights).mean()
         pixel_square = float((left**2).sum()) / max(degrees, 1)
@@ -569,8 +566,9 @@ class _Fit:
             mean, fraction = self.dark_spread.mean * gain, self.dark_spread.fraction
             off = self.dark_slope_dn - mean
             share = _reliability((fraction * mean) ** 2, self.dark_slope_noise)
-            current = np.where(self.is_hot, self.dark_slope_dn, mean + share * off)
-            self.maps["dark_e_per_s"] = np.maximum(current, 0.0) / gain
+            current = np.maximum(mean + share * off, 0.0) / gain
+            current[self.is_hot] = np.fmax(self.hot_e_per_s, np.maximum(self.dark_slope_dn[self.is_hot], 0.0) / gain)
+            self.maps["dark_e_per_s"] = current
             offset = offset - share * off * self.lights[self.shortest[0]].exposure_s
         response = 1.0 + _reliability(max(self.prnu["pixel"][0], 0.0), self.response_noise) * self.response
         self.maps |= {
@@ -594,14 +592,14 @@ class _Fit:
             found["dsnu_fraction"] = Uncertain("the dark stacks have several temperatures")
             return
         spread = self.dark_spread
-        noise = float(self.dark_slope_noise[self.good].mean()) / self.dark_slope**2
         if spread is None:
+            noise = math.sqrt(float(self.dark_slope_noise[self.good].mean())) / self.dark_slope
             found["dsnu_fraction"] = Uncertain(
-                f"the noise of the slopes, {math.sqrt(noise):.3g} e-/s, hides the differences of the dark current: longer dark "
-                "exposures, or more frames"
+                f"the noise of the slopes, {noise:.3g} e-/s, hides differences of the dark current: longer dark exposures, or more "
+                "frames"
             )
             return
-        found["dsnu_fraction"] = of_mean(spread.fraction, spread.log_error, is_log=True)
+        found["dsnu_fraction"] = Estimate(spread.fraction, spread.low, spread.high)
 
     def _report_defects(self, fit: PooledFit) -> None:
         found, n = self.estimates, self.classes.size
@@ -610,14 +608,16 @@ class _Fit:
             found["hot_fraction"] = found["hot_e_per_s"] = Uncertain("it needs dark stacks of two exposure times")
         else:
             found["hot_fraction"] = of_fraction(hot, n)
-            if hot < 3:
-                found["hot_e_per_s"] = Uncertain(f"there are {hot} hot pixels")
+            own = self._hot_currents(fit)
+            self.hot_e_per_s = own
+            own = own[~np.isnan(own)] - fit.values.get("dark_e_per_s", 0.0)
+            if own.size < 3:
+                found["hot_e_per_s"] = Uncertain(f"there are {own.size} hot pixels below saturation")
             else:
-                own = self.dark_slope_dn[self.is_hot] / self.dark_slope - fit.values.get("dark_e_per_s", 0.0)
                 error = math.hypot(
-                    float(own.std(ddof=1)) / math.sqrt(hot), float(own.mean()) * fit.error("gain_dn_per_e")
+                    float(own.std(ddof=1)) / math.sqrt(own.size), float(own.mean()) * fit.error("gain_dn_per_e")
                 )
-                found["hot_e_per_s"] = of_mean(float(own.mean()), error, hot)
+                found["hot_e_per_s"] = of_mean(float(own.mean()), error, own.size)
         found["dead_fraction"] = of_fraction(int(self.is_dead.sum()), n)
         if self.telegraph is None:
             reason = "no pixels have variances that one distribution does not explain"
@@ -630,10 +630,44 @@ class _Fit:
         limits = of_mean(odds, each.log_odds_error)[1:]
         found["rts_fraction"] = Estimate(each.fraction, *(1.0 / (1.0 + math.exp(-limit)) for limit in limits))
         gain_error = fit.error("gain_dn_per_e")
-        found["rts_e"] = of_mean(
-            each.step_dn / self.dark_slope, math.hypot(each.log_step_error, gain_error), is_log=True
-        )
+        found["rts_e"] = of_mean(self._step_e(fit), math.hypot(each.log_step_error, gain_error), is_log=True)
         self.maps["rts_probability"] = self.rts_probability
+
+    def _step_e(self, fit: PooledFit) -> float:
+        """Return the difference of charge between the states of RTS noise: their codes are a step apart."""
+        from scipy.optimize import brentq
+
+        assert self.telegraph is not None
+        step_dn, gain = self.telegraph.step_dn, self.dark_slope
+        dark_e = np.array([fit.values.get("dark_e_per_s", 0.0) * self.lights[self.telegraph_stack].exposure_s])
+        chain = Chain(self.known, 1)
+
+        def code_dn(charge_e: float) -> float:
+            values = {**fit.values, "black_level_dn": fit.values["black_level_dn"] + gain * charge_e}
+            return float(chain.moments(values, np.zeros(1), dark_e).mean_dn[0])
+
+        def above(step_e: float) -> float:
+            return code_dn(0.5 * step_e) - code_dn(-0.5 * step_e) - step_dn
+
+        middle_dn = float(np.median(self.statistics[self.telegraph_stack].mean_dn))
+        guess = step_dn / gain * float(self.adc.width_of_code_dn(middle_dn))
+        low, high = 0.2 * guess, 5.0 * guess
+        return float(brentq(above, low, high, rtol=1e-6)) if above(low) * above(high) < 0.0 else guess
+
+    def _hot_currents(self, fit: PooledFit) -> Floats:
+        """Return the dark currents of hot pixels, (n_hot,) e-/s, from levels below saturation; NaN if there is one only."""
+        values = fit.values
+        top_e = min(values.get("full_well_e", math.inf), 1.1 * self.adc.n_codes / self.dark_slope)
+        charges_e = top_e * np.linspace(0.0, 1.0, N_CHARGES) ** 2
+        codes_dn = Chain(self.known, N_CHARGES).moments(values, charges_e, np.zeros(N_CHARGES)).mean_dn
+        highest = min(np.interp(CLOSE_FRACTION * top_e, charges_e, codes_dn), CLOSE_FRACTION * (self.adc.n_codes - 1))
+        found = np.stack([self.statistics[k].mean_dn[self.is_hot] for k in self.dark])
+        times = np.array([self.lights[k].exposure_s for k in self.dark])[:, None]
+        n = np.array([self.statistics[k].n_frames for k in self.dark], np.float64)[:, None] * (found < highest)
+        off = times - (n * times).sum(axis=0) / np.maximum(n.sum(axis=0), 1.0)
+        squares = (n * off**2).sum(axis=0)
+        slopes = (n * off * np.interp(found, codes_dn, charges_e)).sum(axis=0) / np.where(squares > 0.0, squares, np.nan)
+        return np.asarray(slopes)
 
     def _report_patterns(self, fit: PooledFit) -> None:
         found, weights, blocks = self.estimates, self.levels.weights, self.levels.weights.size

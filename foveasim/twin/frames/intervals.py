@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-__all__ = ["CONFIDENCE", "Estimate", "Uncertain", "of_fraction", "of_mean", "of_squares", "of_variance"]
+__all__ = ["CONFIDENCE", "HALF_WIDTH", "Estimate", "Uncertain", "of_fraction", "of_mean", "of_squares", "of_variance"]
 
 #: Probability that an interval contains the parameter.
 CONFIDENCE = 0.95
 TAIL = 0.5 * (1.0 - CONFIDENCE)
+#: Half an interval of a Gaussian estimate, in standard errors.
+HALF_WIDTH = 1.959963984540054
 
 
 class Estimate(NamedTuple):
@@ -28,9 +30,9 @@ class Uncertain(NamedTuple):
 
 def _quantile(n_blocks: int | None) -> float:
     """Return the two-sided quantile of Student's distribution; None for the normal one."""
-    from scipy.special import ndtri, stdtrit
+    from scipy.special import stdtrit
 
-    return float(ndtri(1.0 - TAIL) if n_blocks is None else stdtrit(max(n_blocks - 1, 1), 1.0 - TAIL))
+    return HALF_WIDTH if n_blocks is None else float(stdtrit(max(n_blocks - 1, 1), 1.0 - TAIL))
 
 
 def of_mean(value: float, error: float, n_blocks: int | None = None, *, is_log: bool = False) -> Estimate:
