@@ -595,8 +595,8 @@ class _Fit:
         if spread is None:
             noise = math.sqrt(float(self.dark_slope_noise[self.good].mean())) / self.dark_slope
             found["dsnu_fraction"] = Uncertain(
-                f"the noise of the slopes, {noise:.3g} e-/s, hides differences of the dark current: longer dark exposures, or more "
-                "frames"
+                f"the noise of the slopes, {noise:.3g} e-/s, hides differences of the dark current: longer dark exposures, or "
+                "more frames"
             )
             return
         found["dsnu_fraction"] = Estimate(spread.fraction, spread.low, spread.high)
