@@ -173,6 +173,71 @@ def test_dark_current_doubles_with_temperature():
     assert (sensor.temperature_k, sensor.dark_reference_k) == (300.0, 300.0)
 
 
+def test_dark_currents_beside_row_noise_and_saturation():
+    """Row noise does not widen the spread of dark currents; hot pixels that fill their wells count by shorter exposures."""
+    rng = np.random.default_rng(11)
+    log = np.sqrt(np.log1p(0.3**2))
+    dark = 100.0 * np.exp(log * rng.normal(size=(N_Y, N_X)) - 0.5 * log**2)
+    hot = rng.choice(N_X * N_Y, 30, replace=False)
+    dark.flat[hot] += 15e3
+
+    def frames(light_e, time_s, n=16):
+        charge = np.minimum(rng.poisson(light_e + dark * time_s, (n, N_Y, N_X)), 6000) + rng.normal(
+            0.0, 4.0, (n, N_Y, N_X)
+        )
+        return np.rint(0.6 * (charge + rng.normal(0.0, 8.0, (n, N_Y, 1))) + 60.0).astype(np.uint16)
+
+    stacks = [
+        fs.twin.Stack(frames(0.0, time_s, n), time_s, light=0) for time_s, n in ((1e-3, 64), (0.1, 16), (0.5, 16))
+    ]
+    stacks += [fs.twin.Stack(frames(3e5 * time_s, time_s), time_s, light=1) for time_s in TIMES_S[:-1]]
+    found = fs.twin.fit(stacks, bits=12, pixel_um=3.0)
+
+    spread, excess = found.estimates["dsnu_fraction"], found.estimates["hot_e_per_s"]
+    assert abs(spread.value - 0.3) < spread.high - spread.low < 0.05
+    assert found.estimates["hot_fraction"].value == 30 / (N_X * N_Y)
+    assert abs(excess.value - 15e3) < excess.high - excess.low < 300.0
+    np.testing.assert_allclose(found.maps["dark_e_per_s"].flat[hot], dark.flat[hot], rtol=0.02)
+
+
+def test_hidden_spread_of_dark_current_has_a_limit():
+    """Equal currents of all pixels: the interval begins at 0."""
+    rng = np.random.default_rng(12)
+
+    def frames(signal_e):
+        charge = rng.poisson(signal_e, (16, N_Y, N_X)) + rng.normal(0.0, 4.0, (16, N_Y, N_X))
+        return np.rint(0.4 * charge + 60.0).astype(np.uint16)
+
+    stacks = [fs.twin.Stack(frames(50.0 * time_s), time_s, light=0) for time_s in (0.01, 1.0)]
+    stacks += [fs.twin.Stack(frames(900.0 * k), 0.01) for k in range(1, 9)]
+    found = fs.twin.fit(stacks, bits=12, pixel_um=3.0).estimates["dsnu_fraction"]
+
+    assert found.low == 0.0
+    assert found.value <= found.high < 0.05
+
+
+@pytest.mark.parametrize("companding", ["linear", "root", "log"])
+def test_steps_of_telegraph_noise_are_charges(companding):
+    """Two states of a pixel, 60 e- apart, in codes of any transfer function."""
+    rng = np.random.default_rng(13)
+    is_telegraph = rng.random((N_Y, N_X)) < 0.05
+
+    def frames(signal_e, n=16):
+        charge = rng.poisson(signal_e, (n, N_Y, N_X)) + rng.normal(0.0, 4.0, (n, N_Y, N_X))
+        charge += np.where(is_telegraph, rng.choice([-30.0, 30.0], (n, N_Y, N_X)), 0.0)
+        part = np.clip((charge + 100.0) / 10e3, 0.0, 1.0)
+        code = {"linear": part, "root": np.sqrt(part), "log": np.log1p(20.0 * part) / np.log(21.0)}[companding]
+        return np.minimum(4096 * code, 4095).astype(np.uint16)
+
+    stacks = [fs.twin.Stack(frames(0.0, 64), 1e-3, light=0)]
+    stacks += [fs.twin.Stack(frames(9e3 * k / 12), 1e-3 * k, light=1) for k in range(1, 13)]
+    adc = {"log_strength": 20.0} if companding == "log" else {}
+    found = fs.twin.fit(stacks, bits=12, pixel_um=3.0, companding=companding, **adc)
+
+    assert found.estimates["rts_e"].value == pytest.approx(60.0, rel=0.02)
+    assert found.estimates["rts_fraction"].value == pytest.approx(is_telegraph.mean(), rel=0.1)
+
+
 def test_colours_of_a_mosaic_share_the_electronics():
     """Levels of red, green and blue differ; gain and noise are those of all, and the top left pixel is red."""
     rng = np.random.default_rng(6)
