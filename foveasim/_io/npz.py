@@ -118,11 +118,27 @@ def read_array(
     before memory is allocated, and may raise. Raises ValueError when the header is invalid or does not match the size, or the
     array contains Python objects.
     """
+    shape, is_fortran, dtype = read_header(file, n_bytes, check)
+    if not dtype.itemsize:
+        return np.zeros(shape, dtype)
+    data = np.empty(math.prod(shape), dtype)
+    read_into(file, data)
+    return data.reshape(shape, order="F" if is_fortran else "C")
+
+
+def read_header(
+    file: IO[bytes], n_bytes: int, check: Callable[[tuple[int, ...], np.dtype[Any]], None] | None = None
+) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """
+    Read shape, whether the order is that of Fortran, and dtype of an array in the ``.npy`` format.
+
+    Parameters and errors are those of :func:`read_array`.
+    """
     version = npy.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"unsupported array format {version}")
-    read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, is_fortran, dtype = read_header(file)
+    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, is_fortran, dtype = read(file)
     if check is not None:
         check(shape, dtype)
     if dtype.hasobject:
@@ -131,13 +147,14 @@ def read_array(
     # The file size does not limit the number of items of zero bytes.
     if n * dtype.itemsize != n_data_bytes or min(shape, default=0) < 0 or n > max(n_bytes, MAX_SITES):
         raise ValueError("the size of an array does not match its header")
-    if not dtype.itemsize:
-        return np.zeros(shape, dtype)
-    data = np.empty(n_data_bytes, np.uint8)
+    return shape, is_fortran, dtype
+
+
+def read_into(file: IO[bytes], array: NDArray[Any]) -> None:
+    """Fill a C-contiguous array with the next bytes of a file; raise ValueError when there are fewer."""
+    target = memoryview(array.reshape(-1).view(np.uint8))
     n_read = 0
-    while n_read < n_data_bytes and (chunk := file.read(min(n_data_bytes - n_read, CHUNK_BYTES))):
-        data[n_read : n_read + len(chunk)] = np.frombuffer(chunk, np.uint8)
-        n_read += len(chunk)
-    if n_read < n_data_bytes:
+    while n_read < len(target) and (n := file.readinto(target[n_read : n_read + CHUNK_BYTES])):  # type: ignore[attr-defined]
+        n_read += n
+    if n_read < len(target):
         raise ValueError("truncated")
-    return data.view(dtype).reshape(shape, order="F" if is_fortran else "C")

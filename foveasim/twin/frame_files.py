@@ -9,17 +9,18 @@ from typing import Any, Literal
 from numpy.typing import NDArray
 
 from foveasim._core.names import missing_path
+from foveasim._core.work_arrays import work_array
 from foveasim._io.formats import FormatError, as_file_error
 from foveasim._io.images import TIFF_EXTENSIONS, read_picture
 from foveasim._io.images._camera import read_mosaic
 from foveasim._io.images._limits import RAW_EXTENSIONS, check_size
 from foveasim._io.images._tiff import pixels_of_page
+from foveasim._io.npz import read_array, read_header, read_into
 from foveasim._io.rasters import max_decompressed_bytes
 from foveasim._io.rasters.fits import open_fits, read_image, select_image
 from foveasim._io.rasters.tiff import check_page
 from foveasim._io.sandbox import read_in_sandbox
 from foveasim.errors import FileError
-from foveasim.maps._npy import read_npy
 
 __all__ = ["EXTENSIONS", "FirstRow", "stored_frames"]
 
@@ -63,8 +64,9 @@ def _frames(path: Path, suffix: str) -> Iterator[NDArray[Any]]:
             yield from _tiff(path)
             return
         if suffix == ".npy":
-            codes = read_npy(path, None).data
-        elif suffix in FITS_EXTENSIONS:
+            yield from _npy(path)
+            return
+        if suffix in FITS_EXTENSIONS:
             with open_fits(path) as file:
                 codes = read_image(select_image(file, None, "the frames"), path.stat().st_size)
         elif suffix in RAW_EXTENSIONS:
@@ -75,6 +77,22 @@ def _frames(path: Path, suffix: str) -> Iterator[NDArray[Any]]:
             if codes.ndim != 2:
                 raise FormatError(f"must have one channel, the codes of the mosaic, got {codes.shape[2]} channels")
         yield from codes if codes.ndim == 3 else [codes]
+
+
+def _npy(path: Path) -> Iterator[NDArray[Any]]:
+    """Yield the arrays of a ``.npy`` file, read one after the other unless their numbers are mixed."""
+    n_bytes = path.stat().st_size
+    with path.open("rb") as file:
+        shape, is_fortran, dtype = read_header(file, n_bytes)
+        if len(shape) not in (2, 3) or not dtype.itemsize or (is_fortran and len(shape) == 3):
+            file.seek(0)
+            codes = read_array(file, n_bytes)
+            yield from codes if codes.ndim == 3 else [codes]
+            return
+        for _ in range(shape[0] if len(shape) == 3 else 1):
+            codes = work_array(shape[::-1] if is_fortran else shape[-2:], dtype)
+            read_into(file, codes)
+            yield codes.T if is_fortran else codes
 
 
 def _tiff(path: Path) -> Iterator[NDArray[Any]]:

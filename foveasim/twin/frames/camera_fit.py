@@ -20,13 +20,13 @@ from foveasim.sensor.adc import ADC, BITS, LOG_STRENGTH, Companding
 from foveasim.twin.frames.fitting import fit_statistics
 from foveasim.twin.frames.result import Twin, twin_of
 from foveasim.twin.frames.stacks import Stack, read_stacks
-from foveasim.twin.frames.statistics import StackStatistics, StackSums, sum_frames
+from foveasim.twin.frames.statistics import StackStatistics, sum_frames
 
 __all__ = ["fit"]
 
 PIXEL = Limits(above=0.0, low=0.1, at_most=1e3, hint="the side of a pixel, in µm")
-#: Arrays of the sums of a stack.
-SUMS = tuple(each.name for each in fields(StackSums))
+#: Arrays of the statistics of a stack.
+STORED = tuple(each.name for each in fields(StackStatistics))
 
 
 def fit(
@@ -60,7 +60,7 @@ def fit(
     companding, log_strength, companding_table, inl_dn
         Transfer function of the ADC, if it is not linear: see :class:`foveasim.sensor.adc.ADC`.
     resume : path, optional
-        Directory for the sums of stacks that have been read, from which an interrupted fit continues.
+        Directory for the statistics of stacks that have been read, from which an interrupted fit continues.
     progress : callable, optional
         Called with the number of stacks that have been read, and of all.
 
@@ -145,34 +145,35 @@ def fit(
 
 
 def _statistics(name: str, stack: Stack, bits: int, resume: Path | None) -> StackStatistics:
-    """Return the statistics of a stack, from sums that are stored if its files did not change."""
+    """Return the statistics of a stack; those that are stored if its files did not change."""
     path = None if resume is None else _sums_path(resume, stack)
-    total = None if path is None else _stored(path)
-    if total is None:
-        total = sum_frames(name, stack)
+    found = None if path is None else _stored(path)
+    if found is None:
+        found = StackStatistics.of(sum_frames(name, stack))
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_archive(path, {}, {each: getattr(total, each) for each in SUMS}, is_compressed=False)
-    _check_codes(name, stack, bits, total)
-    return StackStatistics.of(total)
+            write_archive(path, {}, {each: np.asarray(getattr(found, each)) for each in STORED}, is_compressed=False)
+    _check_codes(name, stack, bits, found)
+    return found
 
 
-def _stored(path: Path) -> StackSums | None:
-    """Return stored sums, None if there are none that can be read."""
+def _stored(path: Path) -> StackStatistics | None:
+    """Return stored statistics, None if there are none that can be read."""
     try:
-        return StackSums(**read_archive(path)[1])
-    except (FoveasimError, TypeError, ValueError, OSError, BadZipFile):
+        arrays = read_archive(path)[1]
+        return StackStatistics(**arrays | {"n_frames": int(arrays["n_frames"])})
+    except (FoveasimError, KeyError, TypeError, ValueError, OSError, BadZipFile):
         return None
 
 
-def _check_codes(name: str, stack: Stack, bits: int, total: StackSums) -> None:
+def _check_codes(name: str, stack: Stack, bits: int, found: StackStatistics) -> None:
     """Compare the codes of a stack with the bits, and warn of dark codes that are 0."""
-    n_zeros, highest, occurring = total.found.tolist()
+    n_zeros, highest, occurring = found.found.tolist()
     if highest >= 2**bits:
         shift = (occurring & -occurring).bit_length() - 1
         hint = f"the codes are multiples of {2**shift}: divide them by it" if shift else ""
         raise ParameterError("bits", f"must be those of the codes: {name} has the code {highest}", bits, hint=hint)
-    n_codes = total.sums.size * len(total.rows)
+    n_codes = found.sums.size * found.n_frames
     if stack.is_dark and n_zeros > MAX_UNDERFLOW_FRACTION * n_codes:
         warn(
             f"{100.0 * n_zeros / n_codes:.2g} % of the codes of {name} are 0: the black level is too low, and noise and "

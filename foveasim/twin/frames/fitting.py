@@ -20,7 +20,7 @@ from foveasim.twin.frames.intervals import Estimate, Uncertain, of_fraction, of_
 from foveasim.twin.frames.levels import Levels, block_means, class_index
 from foveasim.twin.frames.pooled import Exposures, PooledFit, fit_levels
 from foveasim.twin.frames.stacks import Stack
-from foveasim.twin.frames.statistics import StackStatistics
+from foveasim.twin.frames.statistics import LinearStatistics, StackStatistics, weighted
 from foveasim.twin.frames.telegraph import MIN_FRAMES, TelegraphFit, fit_telegraph
 
 __all__ = ["Fitted", "fit_statistics"]
@@ -115,7 +115,8 @@ class _Fit:
         times = sorted({lights[k].exposure_s for k in self.dark})
         self.shortest = [k for k in self.dark if lights[k].exposure_s == times[0]]
         self.has_dark_series = len(times) > 1
-        self.linear = [self._linear(each) for each in statistics]
+        is_linear = self.adc.is_linear
+        self.linear = statistics if is_linear else [LinearStatistics.of_codes(each, self.adc) for each in statistics]
         self.assumptions: list[str] = []
         self.estimates: dict[str, Estimate | Uncertain] = {}
         self.maps: dict[str, Floats] = {}
@@ -140,20 +141,6 @@ class _Fit:
         lowest_k = min(temperatures, default=None)
         return Fitted(self.estimates, self.maps, self.levels, fit, self.assumptions, lowest_k)
 
-    def _linear(self, each: StackStatistics) -> StackStatistics:
-        """Return means and variances in linear codes, for what differs between pixels."""
-        if self.adc.is_linear:
-            return each
-        inside = each.mean_dn.clip(0.0, self.adc.n_codes - 1.0)
-        width = self.adc.width_of_code_dn(inside)
-        return replace(
-            each,
-            mean_dn=self.adc.linear_of_code_dn(inside),
-            variance_dn2=each.variance_dn2 * width**2,
-            row_dn=each.row_dn * width.mean(axis=1),
-            column_dn=each.column_dn * width.mean(axis=0),
-        )
-
     @property
     def good(self) -> Bools:
         """Pixels that are no defects, (n_y, n_x)."""
@@ -170,8 +157,8 @@ class _Fit:
         n = np.array([self.statistics[k].n_frames for k in self.dark], np.float64)
         centre = (n @ times) / n.sum()
         factor = n * (times - centre) / (n @ (times - centre) ** 2)
-        slope = np.tensordot(factor, np.stack([self.linear[k].mean_dn for k in self.dark]), 1)
-        noise = np.tensordot(factor**2 / n, np.stack([self.linear[k].variance_dn2 for k in self.dark]), 1)
+        slope = weighted(factor, (self.linear[k].mean_dn for k in self.dark))
+        noise = weighted(factor**2 / n, (self.linear[k].variance_dn2 for k in self.dark))
         self.dark_slope_dn, self.dark_slope_noise = slope, noise
         # Above the tail of a log-normal distribution with these quantiles.
         middle, above = np.quantile(slope, (0.5, 0.8413))
@@ -314,12 +301,12 @@ class _Fit:
     def _mean_of(self, stacks: Sequence[int]) -> Floats:
         """Return the mean image of stacks, weighted by their frames, (n_y, n_x) DN."""
         n = np.array([self.statistics[k].n_frames for k in stacks], np.float64)
-        return np.asarray(np.tensordot(n / n.sum(), np.stack([self.linear[k].mean_dn for k in stacks]), 1))
+        return weighted(n / n.sum(), (self.linear[k].mean_dn for k in stacks))
 
     def _noise_of(self, stacks: Sequence[int]) -> Floats:
         """Return the variance of :meth:`_mean_of` by temporal noise, (n_y, n_x) DN²."""
         n = np.array([self.statistics[k].n_frames for k in stacks], np.float64)
-        return np.asarray(np.tensordot(n / n.sum() ** 2, np.stack([self.linear[k].variance_dn2 for k in stacks]), 1))
+        return weighted(n / n.sum() ** 2, (self.linear[k].variance_dn2 for k in stacks))
 
     def _exposures(self, levels: Levels) -> Exposures:
         amounts, names = [], []
@@ -416,15 +403,16 @@ class _Fit:
         of_offset, response_noise = np.zeros(offset.shape), np.zeros(offset.shape)
         for k in bright:
             stack = self.linear[int(self.levels.stack[k])]
+            mean_dn, variance_dn2 = stack.mean_dn, stack.variance_dn2
             own = self.classes == self.levels.class_of_level[k]
             slope = 1.0 - bend * float(fit.light_e[k])
             signal = gain * slope * float(fit.light_e[k])
-            weight = signal**2 * stack.n_frames / max(float(stack.variance_dn2[own].mean()), 1e-6)
-            relative = (stack.mean_dn - float(stack.mean_dn[own].mean()) - slope * self.offset_dn) / signal
-            response[own] += weight * relative[own]
-            response_noise[own] += weight**2 * (stack.variance_dn2[own] / stack.n_frames) / signal**2
-            of_offset[own] += weight * slope / signal
-            total[own] += weight
+            weight = signal**2 * stack.n_frames / max(float(variance_dn2.mean(where=own)), 1e-6)
+            mean_dn -= float(mean_dn.mean(where=own)) + slope * self.offset_dn
+            np.add(response, weight / signal * mean_dn, out=response, where=own)
+            np.add(response_noise, weight**2 / stack.n_frames / signal**2 * variance_dn2, out=response_noise, where=own)
+            np.add(of_offset, weight * slope / signal, out=of_offset, where=own)
+            np.add(total, weight, out=total, where=own)
         has = total > 0.0
         total = np.where(has, total, 1.0)
         self.response = np.where(has, response / total, 0.0)

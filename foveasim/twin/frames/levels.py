@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from foveasim._core.threads import cached_property
+from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Floats, Ints
 from foveasim.twin.frames.statistics import StackStatistics
 
@@ -15,6 +15,8 @@ __all__ = ["Levels", "block_means", "block_weights", "class_index", "row_blocks"
 
 #: Largest number of blocks of rows, whose differences give the uncertainty of statistics.
 MAX_BLOCKS = 64
+#: Rows that a thread adds at a time.
+ROWS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +92,18 @@ def block_weights(classes: Ints) -> Floats:
 
 def block_means(values: Floats, classes: Ints, share: Floats | float = 1.0) -> Floats:
     """Return the weighted means of pixels over each class and block, (n_class, n_block)."""
-    blocks = _blocks(classes)
-    found = []
-    for c in range(int(classes.max()) + 1):
-        weights = np.where(classes == c, share, 0.0)
-        totals = np.bincount(blocks, (weights * values).sum(axis=1))
-        found.append(totals / np.maximum(np.bincount(blocks, weights.sum(axis=1)), 1e-300))
-    return np.array(found)
+    from foveasim.twin.frames import _kernels
+
+    totals = np.zeros((int(classes.max()) + 1, classes.shape[0], 2))
+    shares, classes = np.broadcast_to(np.float64(share), classes.shape), np.ascontiguousarray(classes)
+    rows = [range(first, min(first + ROWS, classes.shape[0])) for first in range(0, classes.shape[0], ROWS)]
+
+    def add(part: range) -> None:
+        _kernels.add_classes(values, classes, shares, part.start, part.stop, totals)
+
+    parallel_map(add, rows, thread_count())
+    of_blocks = np.array([[np.bincount(_blocks(classes), each) for each in of_class.T] for of_class in totals])
+    return of_blocks[:, 1] / np.maximum(of_blocks[:, 0], 1e-300)
 
 
 def row_blocks(n_y: int, *, unit: int = 1) -> Ints:

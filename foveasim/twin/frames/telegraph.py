@@ -23,6 +23,8 @@ __all__ = ["TelegraphFit", "fit_telegraph"]
 MIN_RATIO = 18.4
 #: Number of bins of the variances.
 N_BINS = 400
+#: Variances at which the probabilities of RTS noise are computed; others are between them, within 1e-4.
+N_PROBABILITIES = 4096
 #: First amplitudes of the search, in standard deviations of the noise, and first fractions.
 AMPLITUDES, FRACTIONS = (3.0, 6.0, 12.0, 25.0, 60.0), (0.003, 0.03, 0.2)
 #: Smallest number of frames, and of pixels with RTS noise for an interval.
@@ -89,9 +91,10 @@ def fit_telegraph(variance_dn2: Floats, n_frames: int) -> TelegraphFit | None:
         return None
     covariance = np.linalg.pinv(_hessian(negative, found.x))
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    with_rts = fraction * _density(variance_dn2, n_frames, noise, step)
-    without = (1.0 - fraction) * _density(variance_dn2, n_frames, noise, 0.0)
-    probability = np.where(variance_dn2 > 0.0, with_rts / np.maximum(with_rts + without, 1e-300), 0.0)
+    grid = np.geomspace(values.min(), values.max(), N_PROBABILITIES)
+    with_rts = fraction * _density(grid, n_frames, noise, step)
+    without = (1.0 - fraction) * _density(grid, n_frames, noise, 0.0)
+    probability = np.interp(variance_dn2, grid, with_rts / np.maximum(with_rts + without, 1e-300), left=0.0)
     return TelegraphFit(noise, noise * errors[0], fraction, step, errors[1], errors[2], probability)
 
 
