@@ -87,7 +87,7 @@ def add_frames(a, b, c, d, e, f, g, h, n_frames, first, last, centre, sums, squa
             squares_y[x] += (ab + cd) + (ef + gh)
 
 
-@njit(types.void(_any, array_of(types.int64, 2), _any, types.int64, types.int64, types.float64[:, :, ::1]), allocates=False)
+@njit(types.void(_any, array_of(types.int8, 2), _any, types.int64, types.int64, types.float64[:, :, ::1]), allocates=False)
 def add_classes(values, classes, share, first, last, totals):
     """
     Add the weights and weighted values of rows to those of their classes.

@@ -13,6 +13,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from foveasim._core.calls import Limits, OwnCheck
+from foveasim._core.work_arrays import release_memory
 from foveasim._io.npz import read_archive, write_archive
 from foveasim.errors import FoveasimError, FoveasimWarning, ParameterError, warn
 from foveasim.metrics.emva import MAX_UNDERFLOW_FRACTION
@@ -140,6 +141,7 @@ def fit(
             )
         if progress is not None:
             progress(k + 1, len(stacks))
+    release_memory()  # of frames
     known = {"bits": bits, **adc}
     return twin_of(fit_statistics(statistics, stacks, known, mosaic), names, pixel_um, {**known, "mosaic": mosaic})
 

@@ -53,7 +53,8 @@ def fit_dark_spread(slopes: Floats, noise: Floats) -> DarkSpread | None:
     mean, variance = float(slopes.mean()), float(slopes.var())
     if mean < MIN_SIGMAS * math.sqrt(variance / slopes.size):
         return None
-    rise = float(np.cov(slopes, noise)[0, 1]) / variance if variance > 0.0 else 0.0
+    covariance = float((slopes - mean) @ noise) / (slopes.size - 1)
+    rise = covariance / variance if variance > 0.0 else 0.0
     rise = min(max(rise, 0.0), float(noise.mean()) / mean)
     floor = float(noise.mean()) - rise * mean
     edges = np.linspace(slopes.min(), slopes.max(), N_BINS + 1)

@@ -276,14 +276,14 @@ class _Fit:
         assert self.telegraph is not None
         variances, errors = levels.variances_dn2.copy(), np.full(levels.mean_dn.size, np.nan)
         ratios, p = self._slope_ratios(levels, before), self.rts_probability
+        masks = (self.classes == c for c in range(self.n_classes))
+        missed = [float(np.sum(p * (1.0 - p), where=own) / np.sum(1.0 - p, where=own)) for own in masks]
         for k, (stack, c) in enumerate(zip(levels.stack.tolist(), levels.class_of_level.tolist(), strict=True)):
-            own = self.classes == c
             if stack == self.telegraph_stack:
                 variances[k] += self.telegraph.noise_dn2 - float(levels.column_dn2[k] + variances[k] @ levels.weights)
                 errors[k] = self.telegraph.noise_error_dn2
             else:
-                missed = float((p[own] * (1.0 - p[own])).sum() / (1.0 - p[own]).sum())
-                variances[k] -= missed * 0.25 * (self.telegraph.step_dn * ratios[k]) ** 2
+                variances[k] -= missed[c] * 0.25 * (self.telegraph.step_dn * ratios[k]) ** 2
         return replace(levels, variances_dn2=variances), errors
 
     def _slope_ratios(self, levels: Levels, before: PooledFit | None) -> Floats:
@@ -399,24 +399,7 @@ class _Fit:
             and self.levels.mean_dn[k] < LINEAR_FRACTION * (self.adc.n_codes - 1)
             and np.isnan(self.fixed_e[k])
         ]
-        response, total = np.zeros(offset.shape), np.zeros(offset.shape)
-        of_offset, response_noise = np.zeros(offset.shape), np.zeros(offset.shape)
-        for k in bright:
-            stack = self.linear[int(self.levels.stack[k])]
-            mean_dn, variance_dn2 = stack.mean_dn, stack.variance_dn2
-            own = self.classes == self.levels.class_of_level[k]
-            slope = 1.0 - bend * float(fit.light_e[k])
-            signal = gain * slope * float(fit.light_e[k])
-            weight = signal**2 * stack.n_frames / max(float(variance_dn2.mean(where=own)), 1e-6)
-            mean_dn -= float(mean_dn.mean(where=own)) + slope * self.offset_dn
-            np.add(response, weight / signal * mean_dn, out=response, where=own)
-            np.add(response_noise, weight**2 / stack.n_frames / signal**2 * variance_dn2, out=response_noise, where=own)
-            np.add(of_offset, weight * slope / signal, out=of_offset, where=own)
-            np.add(total, weight, out=total, where=own)
-        has = total > 0.0
-        total = np.where(has, total, 1.0)
-        self.response = np.where(has, response / total, 0.0)
-        self.response_noise = (response_noise / total**2) + (of_offset / total) ** 2 * noise
+        self._measure_responses(fit, bright, bend)
         self.has_response = bool(bright)
         prnu = self._spatial(self.response, self.response_noise)
         dsnu = self._spatial(self.offset_dn, noise, self._line_noise())
@@ -440,19 +423,41 @@ class _Fit:
             ),
         )
 
+    def _measure_responses(self, fit: PooledFit, bright: list[int], bend: float) -> None:
+        """Measure responses of pixels by levels, with their variances by temporal noise."""
+        gain, shape = self.dark_slope, self.classes.shape
+        response, total = np.zeros(shape), np.zeros(shape)
+        of_offset, response_noise = np.zeros(shape), np.zeros(shape)
+        for k in bright:
+            stack = self.linear[int(self.levels.stack[k])]
+            mean_dn, variance_dn2 = stack.mean_dn, stack.variance_dn2
+            own = self.classes == self.levels.class_of_level[k]
+            slope = 1.0 - bend * float(fit.light_e[k])
+            signal = gain * slope * float(fit.light_e[k])
+            weight = signal**2 * stack.n_frames / max(float(variance_dn2.mean(where=own)), 1e-6)
+            mean_dn -= float(mean_dn.mean(where=own)) + slope * self.offset_dn
+            np.add(response, weight / signal * mean_dn, out=response, where=own)
+            np.add(response_noise, weight**2 / stack.n_frames / signal**2 * variance_dn2, out=response_noise, where=own)
+            np.add(of_offset, weight * slope / signal, out=of_offset, where=own)
+            np.add(total, weight, out=total, where=own)
+        has = total > 0.0
+        total = np.where(has, total, 1.0)
+        self.response = np.where(has, response / total, 0.0)
+        self.response_noise = (response_noise / total**2) + (of_offset / total) ** 2 * self.offset_noise
+
     def _dark_spread(self) -> DarkSpread | None:
         """Return the distribution of the dark current over pixels, in e-/s."""
         if self.dark_slope_dn is None or self.dark_slope_noise is None:
             return None
         gain, good = self.dark_slope, self.good
         # Noise of rows is common to their pixels, and not in the variances.
-        clean = np.where(good, self.dark_slope_dn, 0.0)
         in_row = good.sum(axis=1, keepdims=True)
-        off = (self.dark_slope_dn - clean.sum(axis=1, keepdims=True) / np.maximum(in_row, 1)) * np.sqrt(
-            in_row / np.maximum(in_row - 1, 1)
-        )
-        slopes = off[good] + clean.sum() / good.sum()
-        return fit_dark_spread(slopes / gain, self.dark_slope_noise[good] / gain**2)
+        sums = self.dark_slope_dn.sum(axis=1, keepdims=True, where=good)
+        off = self.dark_slope_dn - sums / np.maximum(in_row, 1)
+        off *= np.sqrt(in_row / np.maximum(in_row - 1, 1))
+        off += sums.sum() / good.sum()
+        off /= gain
+        return fit_dark_spread(off[good], self.dark_slope_noise[good] / gain**2)
 
     def _centred(self, values: Floats) -> Floats:
         """Return values less the mean of each class."""
@@ -552,12 +557,13 @@ class _Fit:
         offset = self.offset_dn
         if self.dark_spread is not None and self.dark_slope_dn is not None and self.dark_slope_noise is not None:
             mean, fraction = self.dark_spread.mean * gain, self.dark_spread.fraction
-            off = self.dark_slope_dn - mean
-            share = _reliability((fraction * mean) ** 2, self.dark_slope_noise)
-            current = np.maximum(mean + share * off, 0.0) / gain
+            off = _reliability((fraction * mean) ** 2, self.dark_slope_noise) * (self.dark_slope_dn - mean)
+            current = np.maximum(mean + off, 0.0) / gain
             current[self.is_hot] = np.fmax(self.hot_e_per_s, np.maximum(self.dark_slope_dn[self.is_hot], 0.0) / gain)
             self.maps["dark_e_per_s"] = current
-            offset = offset - share * off * self.lights[self.shortest[0]].exposure_s
+            off *= -self.lights[self.shortest[0]].exposure_s
+            off += offset
+            offset = off
         response = 1.0 + _reliability(max(self.prnu["pixel"][0], 0.0), self.response_noise) * self.response
         self.maps |= {
             "offset_e": np.where(self.good, _reliability(spread2, self.offset_noise) * offset, 0.0) / gain,

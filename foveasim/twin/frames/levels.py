@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foveasim._core.threads import cached_property, parallel_map, thread_count
 from foveasim._core.validation import Floats, Ints
@@ -71,7 +72,9 @@ class Levels:
         n_pixels = np.bincount(classes[classes >= 0])
         for k, each in enumerate(stacks):
             means = block_means(each.mean_dn, classes, share)
-            variances = block_means(each.variance_dn2 - each.column_dn2, classes, share)
+            variance_dn2 = each.variance_dn2
+            variance_dn2 -= each.column_dn2
+            variances = block_means(variance_dn2, classes, share)
             noise_dn2 = each.frame_variance_dn2() / each.n_frames
             for c, (mean, variance) in enumerate(zip(means, variances, strict=True)):
                 found = k, c, each.n_frames, n_pixels[c], mean, variance, each.column_dn2, noise_dn2
@@ -95,7 +98,7 @@ def block_means(values: Floats, classes: Ints, share: Floats | float = 1.0) -> F
     from foveasim.twin.frames import _kernels
 
     totals = np.zeros((int(classes.max()) + 1, classes.shape[0], 2))
-    shares, classes = np.broadcast_to(np.float64(share), classes.shape), np.ascontiguousarray(classes)
+    shares, classes = np.broadcast_to(np.float64(share), classes.shape), np.ascontiguousarray(classes, np.int8)
     rows = [range(first, min(first + ROWS, classes.shape[0])) for first in range(0, classes.shape[0], ROWS)]
 
     def add(part: range) -> None:
@@ -114,8 +117,9 @@ def row_blocks(n_y: int, *, unit: int = 1) -> Ints:
     return np.minimum(np.repeat(of_unit, unit)[np.minimum(np.arange(n_y), n_units * unit - 1)], n_blocks - 1)
 
 
-def class_index(n_y: int, n_x: int, mosaic: str | None) -> Ints:
+def class_index(n_y: int, n_x: int, mosaic: str | None) -> NDArray[np.int8]:
     """Return the class of each pixel, (n_y, n_x): 0, or the position in a mosaic of 2 x 2."""
     if mosaic is None:
-        return np.zeros((n_y, n_x), np.int64)
-    return (np.arange(n_y)[:, None] % 2) * 2 + np.arange(n_x) % 2
+        return np.zeros((n_y, n_x), np.int8)
+    of_row, of_column = (np.arange(n, dtype=np.int8) % 2 for n in (n_y, n_x))
+    return of_row[:, None] * np.int8(2) + of_column
