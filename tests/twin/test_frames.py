@@ -238,6 +238,33 @@ def test_steps_of_telegraph_noise_are_charges(companding):
     assert found.estimates["rts_fraction"].value == pytest.approx(is_telegraph.mean(), rel=0.1)
 
 
+@pytest.mark.parametrize("deviation_dn", [0.0, 0.3])
+def test_offsets_of_codes_are_not_read_noise(deviation_dn):
+    """Each column moves the samples of each code by its own offset (Gaussian), which is DNL."""
+    rng = np.random.default_rng(14)
+    n_y, n_x = 512, 16
+    offset = rng.normal(0.0, 1.0, (n_x, 4096)) * deviation_dn
+
+    def frames(signal_e, n=16):
+        charge = rng.poisson(signal_e, (n, n_y, n_x)) + rng.normal(0.0, 4.0, (n, n_y, n_x))
+        value = 0.4 * charge + 60.5
+        return np.floor(value + offset[np.arange(n_x), np.floor(value).astype(int)]).astype(np.uint16)
+
+    stacks = [fs.twin.Stack(frames(0.0), 1e-3, light=0)]
+    stacks += [fs.twin.Stack(frames(900.0 * k), 1e-3 * k, light=1) for k in range(1, 9)]
+    found = fs.twin.fit(stacks, bits=12, pixel_um=3.0)
+
+    each, noise = found.estimates["dnl_dn"], found.estimates["read_noise_e"]
+    assert abs(each.value - deviation_dn) < each.high - each.low < 0.06
+    assert (each.low > 0.0) == (deviation_dn > 0.0)
+    assert abs(noise.value - 4.0) < noise.high - noise.low < 0.2
+    assert found.sensor().dnl_dn == (each.value if deviation_dn else 0.0)
+
+
+def test_few_frames_have_no_offsets_of_codes(twin):
+    assert "25 samples of each code" in twin.not_identifiable["dnl_dn"]
+
+
 def test_colours_of_a_mosaic_share_the_electronics():
     """Levels of red, green and blue differ; gain and noise are those of all, and the top left pixel is red."""
     rng = np.random.default_rng(6)

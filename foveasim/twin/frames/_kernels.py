@@ -87,7 +87,17 @@ def add_frames(a, b, c, d, e, f, g, h, n_frames, first, last, centre, sums, squa
             squares_y[x] += (ab + cd) + (ef + gh)
 
 
-@njit(types.void(_any, array_of(types.int8, 2), _any, types.int64, types.int64, types.float64[:, :, ::1]), allocates=False)
+@njit([types.void(codes, array_of(types.int64, 1), types.uint32[:, ::1]) for codes in _codes], allocates=False)
+def count_codes(codes, columns, counts):
+    """Count the codes (n_y, n_x) of every second row in some columns, (n_column, n_code)."""
+    for y in range(0, codes.shape[0], 2):
+        for j in range(columns.size):
+            counts[j, codes[y, columns[j]]] += np.uint32(1)
+
+
+@njit(
+    types.void(_any, array_of(types.int8, 2), _any, types.int64, types.int64, types.float64[:, :, ::1]), allocates=False
+)
 def add_classes(values, classes, share, first, last, totals):
     """
     Add the weights and weighted values of rows to those of their classes.

@@ -87,6 +87,7 @@ def fit(
     Means and variances of the levels are those of the sensor's chain (:meth:`foveasim.Sensor.predict`), with quantisation,
     companding, clipping, nonlinearity and the nonuniformity of the pixels; the parameters maximise their likelihood. RTS noise
     is a mixture of noncentral chi-square distributions of the variances of pixels, the dark current a log-normal distribution.
+    DNL follows from the frequencies of codes in some columns, each of which has an ADC of its own.
     Intervals contain differences between blocks of rows. They do not contain errors that all frames share, such as a light
     that drifts with the exposure time.
 

@@ -40,10 +40,10 @@ def fit_code_widths(histograms: Sequence[Ints]) -> Estimate | Uncertain:
     squares, weights = np.zeros(n_columns), np.zeros(n_columns)
     for counts in histograms:
         for j, column in enumerate(counts):
-            found = _third_differences(column)
-            if found is None:
+            differences = _third_differences(column)
+            if differences is None:
                 continue
-            excess, share = found
+            excess, share = differences
             squares[j] += share @ excess
             weights[j] += share.sum()
     used = weights > 0.0
@@ -56,8 +56,15 @@ def fit_code_widths(histograms: Sequence[Ints]) -> Estimate | Uncertain:
     mean = float(shares @ values)
     n = values.size
     error = math.sqrt(float((shares**2) @ (values - mean) ** 2) * n / (n - 1))
+    # Above the largest mean square, transitions are in no order.
     table = _mean_squares(OFFSETS_DN)
-    return Estimate(*(float(np.interp(each, table, OFFSETS_DN)) for each in of_mean(mean, error, n)))
+    last = int(np.argmax(table))
+    found = Estimate(
+        *(float(np.interp(each, table[: last + 1], OFFSETS_DN[: last + 1])) for each in of_mean(mean, error, n))
+    )
+    if found.high == OFFSETS_DN[last]:
+        return Uncertain(f"codes are in no order: it is above {found.low:.2g} DN")
+    return found
 
 
 def _third_differences(counts: Ints) -> tuple[Floats, Floats] | None:
@@ -102,7 +109,5 @@ def _mean_squares(offset_dn: Floats) -> Floats:
         moved[rows, whole + reach + 1] = offset - whole
         off = moved - weights @ moved
         covariance = (off * weights[:, None]).T @ off
-        found[k] = sum(
-            factor * np.trace(covariance, lag) for factor, lag in zip(between, range(-3, 4), strict=True)
-        )
+        found[k] = sum(factor * np.trace(covariance, lag) for factor, lag in zip(between, range(-3, 4), strict=True))
     return found

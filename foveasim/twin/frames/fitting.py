@@ -15,8 +15,17 @@ from foveasim.errors import ParameterError
 from foveasim.metrics.photon_transfer import MIN_DARK_DN2
 from foveasim.sensor.adc import ADC, QUANTISATION_DN2
 from foveasim.twin.frames.chain import Chain, Spread
+from foveasim.twin.frames.code_widths import fit_code_widths
 from foveasim.twin.frames.dark_current import DarkSpread, fit_dark_spread
-from foveasim.twin.frames.intervals import Estimate, Uncertain, of_fraction, of_mean, of_squares, of_variance
+from foveasim.twin.frames.intervals import (
+    HALF_WIDTH,
+    Estimate,
+    Uncertain,
+    of_fraction,
+    of_mean,
+    of_squares,
+    of_variance,
+)
 from foveasim.twin.frames.levels import Levels, block_means, class_index
 from foveasim.twin.frames.pooled import Exposures, PooledFit, fit_levels
 from foveasim.twin.frames.stacks import Stack
@@ -37,6 +46,8 @@ MAX_NONLINEARITY_ERROR = 0.1
 ROUNDS = 3
 #: Fraction of the full well above which the first fit leaves out levels.
 CLOSE_FRACTION = 0.85
+#: Gain above which, and read noise below which, codes of whole electrons are more frequent than those between.
+MAX_GAIN, MIN_READ_E = 0.7, 0.6
 #: Probability of RTS noise from which a pixel is left out of offsets.
 MAX_RTS = 0.5
 #: Charges of the response by which the signals of hot pixels become charges.
@@ -208,6 +219,8 @@ class _Fit:
         exposures = self._exposures(levels)
         if before is None:
             self.start = start = self._start(levels, exposures)
+            clear = np.unique(levels.stack[start.is_used & ~start.is_close])
+            self.estimates["dnl_dn"] = fit_code_widths([self.statistics[k].counts for k in clear])
             names, is_used, light_e = dict(start.values), start.is_used & ~start.is_close, start.light_e
             self.well_e = names.pop("full_well_e", None)
         else:
@@ -217,8 +230,9 @@ class _Fit:
             if self.well_e is not None and "full_well_e" not in names:
                 names["full_well_e"] = math.nan
         self.is_used, used = is_used, np.flatnonzero(is_used)
+        dnl_dn2, dnl_error_dn2 = self._dnl()
         self.levels, self.exposures, self.fixed_e = (
-            _selected(levels, used),
+            _selected(replace(levels, variances_dn2=levels.variances_dn2 - dnl_dn2), used),
             _chosen(exposures, used),
             start.fixed_e[used],
         )
@@ -230,7 +244,7 @@ class _Fit:
         def fit(names: Mapping[str, float]) -> PooledFit:
             return fit_levels(
                 self.chain, self.levels, self.exposures, names, light_e[used], fixed_e=self.fixed_e,
-                variance_error_dn2=errors[used],
+                variance_error_dn2=errors[used], common_error_dn2=dnl_error_dn2,
             )  # fmt: skip
 
         found = fit(names)
@@ -241,6 +255,13 @@ class _Fit:
             )
             found = fit({name: value for name, value in self.start_names(found).items() if name != bend})
         return found
+
+    def _dnl(self) -> tuple[float, float]:
+        """Return the variance by DNL, which all levels have, and its standard error, DN²."""
+        found = self.estimates["dnl_dn"]
+        if isinstance(found, Uncertain) or not found.low:
+            return 0.0, 0.0
+        return found.value**2, (found.high**2 - found.low**2) / (2.0 * HALF_WIDTH)
 
     def _full_well(self, before: PooledFit, start_e: Floats) -> float:
         """Return the full well with the mean of the highest level, after a fit without it, e-."""
@@ -545,6 +566,8 @@ class _Fit:
         self._report_defects(fit)
         self._report_patterns(fit)
         self._report_lines()
+        if values["gain_dn_per_e"] > MAX_GAIN and values["read_noise_e2"] < MIN_READ_E**2:
+            found["dnl_dn"] = Uncertain("single electrons make some codes more frequent than others")
         if isinstance(found["read_noise_e"], Uncertain):
             names = ("dsnu_e", "dsnu_row_e", "dsnu_column_e", "row_noise_e", "column_noise_e", "rts_fraction", "rts_e")
             found |= dict.fromkeys(names, found["read_noise_e"])
@@ -660,7 +683,9 @@ class _Fit:
         n = np.array([self.statistics[k].n_frames for k in self.dark], np.float64)[:, None] * (found < highest)
         off = times - (n * times).sum(axis=0) / np.maximum(n.sum(axis=0), 1.0)
         squares = (n * off**2).sum(axis=0)
-        slopes = (n * off * np.interp(found, codes_dn, charges_e)).sum(axis=0) / np.where(squares > 0.0, squares, np.nan)
+        slopes = (n * off * np.interp(found, codes_dn, charges_e)).sum(axis=0) / np.where(
+            squares > 0.0, squares, np.nan
+        )
         return np.asarray(slopes)
 
     def _report_patterns(self, fit: PooledFit) -> None:

@@ -102,17 +102,19 @@ def fit_levels(
     *,
     fixed_e: Floats,
     variance_error_dn2: Floats,
+    common_error_dn2: float = 0.0,
 ) -> PooledFit:
     """
     Return the parameters that explain the levels best.
 
     ``start``: first values of all parameters that are fitted. ``start_e`` (n_level,): first charges of levels of unknown light.
     ``fixed_e`` (n_level,): charges of levels whose light cannot be determined, or NaN. ``variance_error_dn2`` (n_level,):
-    standard error of the variance of a level where it does not follow from the blocks, or NaN.
+    standard error of the variance of a level where it does not follow from the blocks, or NaN. ``common_error_dn2``: of
+    all variances together.
     """
     model = _Model(chain, levels, exposures, tuple(start), start_e, fixed_e)
     vector = model.pack(start)
-    model.add_errors_of_spread(vector)
+    model.add_common_errors(vector, common_error_dn2)
     damping = DAMPING
     moments = model.moments(vector)
     whiten = model.whitening(moments)
@@ -218,8 +220,10 @@ class _Model:
             dark_e = dark_e * 2.0 ** ((self.exposures.temperature_k - reference_k) / values["dark_doubling_k"])
         return values, light_e, dark_e
 
-    def add_errors_of_spread(self, vector: Floats) -> None:
-        """Include the errors of the spread over pixels in the covariance."""
+    def add_common_errors(self, vector: Floats, variance_error_dn2: float) -> None:
+        """Include the errors of all variances, and of the spread over pixels, in the covariance."""
+        n = self.levels.mean_dn.size
+        self.common[n:, n:] = variance_error_dn2**2
         at = self.moments(vector).statistics
         for spread in self.chain.spread.deviating():
             change = replace(self.chain, spread=spread).moments(*self.charges(vector)).statistics - at

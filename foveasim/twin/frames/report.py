@@ -41,6 +41,7 @@ TITLES = {
     "column_noise_e": "temporal noise of columns",
     "full_well_e": "full well",
     "nonlinearity_fraction": "response nonlinearity, loss at the end of the range",
+    "dnl_dn": "DNL: offsets of codes in a column, standard deviation",
     "dark_e_per_s": "dark current",
     "dark_doubling_k": "temperature rise that doubles the dark current",
     "dsnu_fraction": "nonuniformity of the dark current, over its mean",

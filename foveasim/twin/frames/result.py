@@ -192,6 +192,8 @@ class Twin:
             "read_noise_e": self.value("read_noise_e"),
             "nonlinearity_fraction": self.value("nonlinearity_fraction"),
         }
+        if "dnl_dn" in self.estimates and self.estimates["dnl_dn"].low > 0.0:
+            found["dnl_dn"] = self.value("dnl_dn")
         if "qe" in self.estimates:
             found["qe"] = min(self.value("qe"), 1.0)
         if "full_well_e" in self.estimates:

@@ -30,6 +30,8 @@ MAX_PROBABILITY = 1e-3
 MIN_COLUMNS = 2
 #: Largest number of codes whose sum has 32 bits.
 MAX_SUMMED = 1 << 16
+#: Number of columns whose codes are counted, and of codes.
+COUNTED, N_CODES = 64, 1 << 16
 #: Frames that are added at once, with one access to the sums of pixels.
 BATCH = 8
 #: Pixels of the rows that a thread adds at a time.
@@ -43,7 +45,8 @@ class StackSums:
 
     ``sums`` (n_y, n_x) uint32 or int64: of codes. ``squares`` (n_y, n_x) float64, whole numbers: of d (n_x d - 2 t), with
     differences d from ``centre``, and their sums t in the row. ``rows`` (n_frame, n_y), ``columns`` (n_frame, n_x) int64: sums
-    of codes in lines. ``found`` (3,): number of zeros, highest code, and bits that occur.
+    of codes in lines. ``found`` (3,): number of zeros, highest code, and bits that occur. ``counts``: see
+    :class:`StackStatistics`.
     """
 
     sums: Ints
@@ -52,6 +55,7 @@ class StackSums:
     rows: Ints
     columns: Ints
     found: Ints
+    counts: NDArray[np.uint32]
 
     @classmethod
     def zeros(cls, like: NDArray[Any]) -> StackSums:
@@ -59,7 +63,8 @@ class StackSums:
         (n_y, n_x), sample = like.shape, like[:: max(1, like.shape[0] // 64)]
         lines = (np.zeros((0, n), np.int64) for n in (n_y, n_x))
         sums, squares = np.zeros(like.shape, np.uint32), np.zeros(like.shape)
-        return cls(sums, squares, float(np.rint(sample.mean())), *lines, np.zeros(3, np.int64))
+        counts = np.zeros((min(n_x, COUNTED), N_CODES), np.uint32)
+        return cls(sums, squares, float(np.rint(sample.mean())), *lines, np.zeros(3, np.int64), counts)
 
 
 def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
@@ -87,6 +92,7 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
                 if codes.shape != total.sums.shape:
                     sizes = f"{_size(total.sums.shape)} and {_size(codes.shape)}"
                     raise ParameterError("frames", f"must have the same size, but {name} has frames of {sizes}")
+            _count(batch, total.counts)
             of_rows, of_columns = _add(batch, total)
             rows.append(of_rows)
             columns.append(of_columns)
@@ -101,6 +107,7 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
     if whole is not None:
         total.sums = whole + total.sums
     total.rows, total.columns = np.concatenate(rows), np.concatenate(columns)
+    total.counts = total.counts[:, : total.found[1] + 1].copy()
     return total
 
 
@@ -126,6 +133,21 @@ def _add(batch: list[NDArray[Any]], total: StackSums) -> tuple[Ints, Ints]:
         columns += of_columns[:n_frames]
         total.found[:] = total.found[0] + n_zeros, max(total.found[1], highest), total.found[2] | bits
     return rows[:n_frames], columns
+
+
+def _count(batch: list[NDArray[Any]], counts: NDArray[np.uint32]) -> None:
+    """Count the codes of some columns, each in one thread."""
+    from foveasim.twin.frames import _kernels
+
+    n_x = batch[0].shape[1]
+    columns = np.arange(len(counts)) * n_x // len(counts)
+
+    def count(part: slice) -> None:
+        for codes in batch:
+            _kernels.count_codes(codes, columns[part], counts[part])
+
+    step = -(-len(counts) // thread_count())
+    parallel_map(count, [slice(first, first + step) for first in range(0, len(counts), step)], thread_count())
 
 
 def _bands(n_y: int, n_x: int) -> list[slice]:
@@ -176,6 +198,9 @@ class StackStatistics:
         Deviations of rows and columns of each frame from their mean over frames.
     found : (3,) int64
         Number of codes that are 0, highest code, and bits that occur.
+    counts : (n_column, n_code) uint32
+        Number of times that codes up to the highest one occur in the even rows, which have one colour of a mosaic, of some
+        columns.
     """
 
     n_frames: int
@@ -184,6 +209,7 @@ class StackStatistics:
     row_dn: Floats
     column_dn: Floats
     found: Ints
+    counts: NDArray[np.uint32]
 
     @classmethod
     def of(cls, total: StackSums) -> StackStatistics:
@@ -208,7 +234,7 @@ class StackStatistics:
             variances[band] = np.maximum(residual, 0.0)
 
         parallel_map(fill, _bands(n_y, n_x), thread_count())
-        return cls(n, total.sums, variances, row_dn, column_dn, total.found)
+        return cls(n, total.sums, variances, row_dn, column_dn, total.found, total.counts)
 
     @property
     def shape(self) -> tuple[int, int]:
