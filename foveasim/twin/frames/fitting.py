@@ -132,6 +132,7 @@ class _Fit:
         self.estimates: dict[str, Estimate | Uncertain] = {}
         self.maps: dict[str, Floats] = {}
         self.telegraph: TelegraphFit | None = None
+        self.step_dn = 0.0
         self.is_used: Bools = np.zeros(0, np.bool_)
 
     # -- steps ------------------------------------------------------------------------------------------------------
@@ -171,6 +172,9 @@ class _Fit:
         slope = weighted(factor, (self.linear[k].mean_dn for k in self.dark))
         noise = weighted(factor**2 / n, (self.linear[k].variance_dn2 for k in self.dark))
         self.dark_slope_dn, self.dark_slope_noise = slope, noise
+        squares = [self.linear[k].mean_squares_dn2 for k in self.dark]
+        rows_dn2 = np.array([each["row"] - each["pixel"] for each in squares]) / slope.shape[1]
+        self.dark_slope_of_rows = max(float((factor**2 / n) @ rows_dn2), 0.0)
         # Above the tail of a log-normal distribution with these quantiles.
         middle, above = np.quantile(slope, (0.5, 0.8413))
         tail = float(ndtri(1.0 - HOT_PROBABILITY / slope.size))
@@ -202,9 +206,11 @@ class _Fit:
         self.rts_probability = np.zeros(stack.shape)
         if np.median(stack.variance_dn2) < MIN_DARK_DN2:
             return
-        self.telegraph = fit_telegraph(stack.variance_dn2[self.good], stack.n_frames)
+        # In linear codes: the steps of pixels with different offsets are nearly equal.
+        self.telegraph = fit_telegraph(self.linear[self.telegraph_stack].variance_dn2[self.good], stack.n_frames)
         if self.telegraph is not None:
             self.rts_probability[self.good] = self.telegraph.probability
+            self.step_dn = self.telegraph.step_dn / float(self.adc.width_of_code_dn(np.median(stack.mean_dn)))
 
     def _fit_chain(self, spread: Spread, before: PooledFit | None) -> PooledFit:
         """
@@ -301,10 +307,14 @@ class _Fit:
         missed = [float(np.sum(p * (1.0 - p), where=own) / np.sum(1.0 - p, where=own)) for own in masks]
         for k, (stack, c) in enumerate(zip(levels.stack.tolist(), levels.class_of_level.tolist(), strict=True)):
             if stack == self.telegraph_stack:
-                variances[k] += self.telegraph.noise_dn2 - float(levels.column_dn2[k] + variances[k] @ levels.weights)
-                errors[k] = self.telegraph.noise_error_dn2
+                linear_dn2 = np.average(
+                    self.linear[stack].variance_dn2, weights=np.where(self.classes == c, 1.0 - p, 0.0)
+                )
+                measured_dn2 = float(levels.column_dn2[k] + variances[k] @ levels.weights)
+                variances[k] += (self.telegraph.noise_dn2 / float(linear_dn2) - 1.0) * measured_dn2
+                errors[k] = self.telegraph.noise_error_dn2 / float(linear_dn2) * measured_dn2
             else:
-                variances[k] -= missed[c] * 0.25 * (self.telegraph.step_dn * ratios[k]) ** 2
+                variances[k] -= missed[c] * 0.25 * (self.step_dn * ratios[k]) ** 2
         return replace(levels, variances_dn2=variances), errors
 
     def _slope_ratios(self, levels: Levels, before: PooledFit | None) -> Floats:
@@ -471,14 +481,15 @@ class _Fit:
         if self.dark_slope_dn is None or self.dark_slope_noise is None:
             return None
         gain, good = self.dark_slope, self.good
-        # Noise of rows is common to their pixels, and not in the variances.
-        in_row = good.sum(axis=1, keepdims=True)
+        # Noise of rows is common to their pixels, and not in the variances: it is subtracted as far as means of rows show it.
+        of_rows, in_row = self.dark_slope_of_rows, np.maximum(good.sum(axis=1, keepdims=True), 1)
         sums = self.dark_slope_dn.sum(axis=1, keepdims=True, where=good)
-        off = self.dark_slope_dn - sums / np.maximum(in_row, 1)
-        off *= np.sqrt(in_row / np.maximum(in_row - 1, 1))
-        off += sums.sum() / good.sum()
-        off /= gain
-        return fit_dark_spread(off[good], self.dark_slope_noise[good] / gain**2)
+        middle = float(sums.sum() / good.sum())
+        share = of_rows / (of_rows + self.dark_slope_dn.var(where=good) / in_row)
+        off = (self.dark_slope_dn - middle - share * (sums / in_row - middle)) / gain
+        off /= np.sqrt(1.0 - share * (2.0 - share) / (in_row + 1))
+        noise = self.dark_slope_noise + (1.0 - share) * of_rows
+        return fit_dark_spread(off[good] + middle / gain, noise[good] / gain**2)
 
     def _centred(self, values: Floats) -> Floats:
         """Return values less the mean of each class."""
@@ -651,7 +662,11 @@ class _Fit:
         self.maps["rts_probability"] = self.rts_probability
 
     def _step_e(self, fit: PooledFit) -> float:
-        """Return the difference of charge between the states of RTS noise: their codes are a step apart."""
+        """
+        Return the difference of charge between the states of RTS noise.
+
+        Their codes, in linear codes by the width at their mean, are a step apart.
+        """
         from scipy.optimize import brentq
 
         assert self.telegraph is not None
@@ -664,10 +679,10 @@ class _Fit:
             return float(chain.moments(values, np.zeros(1), dark_e).mean_dn[0])
 
         def above(step_e: float) -> float:
-            return code_dn(0.5 * step_e) - code_dn(-0.5 * step_e) - step_dn
+            upper, lower = code_dn(0.5 * step_e), code_dn(-0.5 * step_e)
+            return (upper - lower) * float(self.adc.width_of_code_dn(0.5 * (upper + lower))) - step_dn
 
-        middle_dn = float(np.median(self.statistics[self.telegraph_stack].mean_dn))
-        guess = step_dn / gain * float(self.adc.width_of_code_dn(middle_dn))
+        guess = step_dn / gain
         low, high = 0.2 * guess, 5.0 * guess
         return float(brentq(above, low, high, rtol=1e-6)) if above(low) * above(high) < 0.0 else guess
 
