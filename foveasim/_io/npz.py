@@ -152,7 +152,7 @@ def read_header(
 
 def read_into(file: IO[bytes], array: NDArray[Any]) -> None:
     """Fill a C-contiguous array with the next bytes of a file; raise ValueError when there are fewer."""
-    target = memoryview(array.reshape(-1).view(np.uint8))
+    target = array.reshape(-1).view(np.uint8).data
     n_read = 0
     while n_read < len(target) and (n := file.readinto(target[n_read : n_read + CHUNK_BYTES])):  # type: ignore[attr-defined]
         n_read += n

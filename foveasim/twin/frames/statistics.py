@@ -34,6 +34,8 @@ MAX_SUMMED = 1 << 16
 COUNTED, N_CODES = 64, 1 << 16
 #: Frames that are added at once, with one access to the sums of pixels.
 BATCH = 8
+#: Name of the threads that read frames.
+READER = "foveasim-frames"
 #: Pixels of the rows that a thread adds at a time.
 BAND_PIXELS = 1 << 18
 
@@ -49,7 +51,7 @@ class StackSums:
     :class:`StackStatistics`.
     """
 
-    sums: Ints
+    sums: NDArray[Any]
     squares: Floats
     centre: float
     rows: Ints
@@ -61,10 +63,11 @@ class StackSums:
     def zeros(cls, like: NDArray[Any]) -> StackSums:
         """Return sums over no frames, for frames as one of a stack."""
         (n_y, n_x), sample = like.shape, like[:: max(1, like.shape[0] // 64)]
-        lines = (np.zeros((0, n), np.int64) for n in (n_y, n_x))
-        sums, squares = np.zeros(like.shape, np.uint32), np.zeros(like.shape)
+        rows, columns = (np.zeros((0, n), np.int64) for n in (n_y, n_x))
+        sums: NDArray[Any] = np.zeros(like.shape, np.uint32)
+        centre, found = float(np.rint(sample.mean())), np.zeros(3, np.int64)
         counts = np.zeros((min(n_x, COUNTED), N_CODES), np.uint32)
-        return cls(sums, squares, float(np.rint(sample.mean())), *lines, np.zeros(3, np.int64), counts)
+        return cls(sums, np.zeros(like.shape), centre, rows, columns, found, counts)
 
 
 def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
@@ -83,7 +86,7 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
     total: StackSums | None = None
     whole: Ints | None = None
     rows, columns, n_frames = [], [], 0
-    with ThreadPoolExecutor(1) as reader:
+    with ThreadPoolExecutor(1, thread_name_prefix=READER) as reader:
         ahead = reader.submit(read)
         while batch := ahead.result():
             ahead = reader.submit(read)
@@ -98,7 +101,7 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
             columns.append(of_columns)
             n_frames += len(batch)
             if n_frames % MAX_SUMMED == 0:  # more would exceed 32 bits
-                whole = total.sums + (0 if whole is None else whole)
+                whole = total.sums.astype(np.int64) + (0 if whole is None else whole)
                 total.sums[:] = 0
     if total is None or n_frames < 2:
         raise ParameterError(
@@ -121,7 +124,7 @@ def _add(batch: list[NDArray[Any]], total: StackSums) -> tuple[Ints, Ints]:
     batch = batch + [np.zeros((n_y, n_x), batch[0].dtype)] * (BATCH - n_frames)
     rows = np.zeros((BATCH, n_y), np.int64)
 
-    def add(band: slice) -> tuple[Ints, Ints]:
+    def add(band: slice) -> tuple[NDArray[np.uint32], Ints]:
         columns, found = np.zeros((BATCH, n_x), np.uint32), np.zeros(3, np.int64)
         _kernels.add_frames(
             *batch, n_frames, band.start, band.stop, total.centre, total.sums, total.squares, rows, columns, found
@@ -204,7 +207,7 @@ class StackStatistics:
     """
 
     n_frames: int
-    sums: Ints
+    sums: NDArray[Any]
     variances: NDArray[np.float32]
     row_dn: Floats
     column_dn: Floats
