@@ -30,7 +30,7 @@ def add_frames(a, b, c, d, e, f, g, h, n_frames, first, last, centre, sums, squa
     """
     Add rows ``first`` to ``last`` of the codes (n_y, n_x) of eight frames to the sums of pixels and lines.
 
-    Only ``n_frames`` of them count; the others must be 0. ``sums`` and ``squares`` (n_y, n_x) are those of
+    Only ``n_frames`` of them count; the others must be 0. ``sums`` and ``squares`` (n_y, n_x): ``sums`` and ``squares_dn2`` of
     ``StackSums``, with ``centre``. ``rows`` (8, n_y), ``columns`` (8, n_x): sums of lines. ``found`` (3,): number of zeros,
     highest code, and bits that occur.
 

@@ -406,7 +406,7 @@ class _Fit:
         values = fit.values
         used = np.flatnonzero(self.is_used)
         self.dark_slope = gain = values["gain_dn_per_e"]
-        bend = 2.0 * values.get("nonlinearity_fraction", 0.0) * gain / self.adc.n_codes
+        bend_per_e = 2.0 * values.get("nonlinearity_fraction", 0.0) * gain / self.adc.n_codes
         offset, noise = self._mean_of(self.shortest), self._noise_of(self.shortest)
         self.offset_dn = self._centred(offset)
         self.offset_noise = noise
@@ -420,7 +420,7 @@ class _Fit:
             and self.levels.mean_dn[k] < LINEAR_FRACTION * (self.adc.n_codes - 1)
             and np.isnan(self.fixed_e[k])
         ]
-        self._measure_responses(fit, bright, bend)
+        self._measure_responses(fit, bright, bend_per_e)
         self.has_response = bool(bright)
         prnu = self._spatial(self.response, self.response_noise)
         dsnu = self._spatial(self.offset_dn, noise, self._line_noise())
@@ -444,7 +444,7 @@ class _Fit:
             ),
         )
 
-    def _measure_responses(self, fit: PooledFit, bright: list[int], bend: float) -> None:
+    def _measure_responses(self, fit: PooledFit, bright: list[int], bend_per_e: float) -> None:
         """Measure responses of pixels by levels, with their variances by temporal noise."""
         gain, classes = self.dark_slope, self.classes
         response, response_noise = np.zeros(classes.shape), np.zeros(classes.shape)
@@ -452,7 +452,7 @@ class _Fit:
         for k in bright:
             stack, c = self.linear[int(self.levels.stack[k])], int(self.levels.class_of_level[k])
             mean_dn, variance_dn2, own = stack.mean_dn, stack.variance_dn2, classes == c
-            slope = 1.0 - bend * float(fit.light_e[k])
+            slope = 1.0 - bend_per_e * float(fit.light_e[k])
             signal = gain * slope * float(fit.light_e[k])
             weight = signal**2 * stack.n_frames / max(float(variance_dn2.mean(where=own)), 1e-6)
             mean_dn -= float(mean_dn.mean(where=own)) + slope * self.offset_dn

@@ -45,14 +45,14 @@ class StackSums:
     """
     Sums over the frames of a stack.
 
-    ``sums`` (n_y, n_x) uint32 or int64: of codes. ``squares`` (n_y, n_x) float64, whole numbers: of d (n_x d - 2 t), with
+    ``sums`` (n_y, n_x) uint32 or int64: of codes. ``squares_dn2`` (n_y, n_x) float64, whole numbers: of d (n_x d - 2 t), with
     differences d from ``centre``, and their sums t in the row. ``rows`` (n_frame, n_y), ``columns`` (n_frame, n_x) int64: sums
     of codes in lines. ``found`` (3,): number of zeros, highest code, and bits that occur. ``counts``: see
     :class:`StackStatistics`.
     """
 
     sums: NDArray[Any]
-    squares: Floats
+    squares_dn2: Floats
     centre: float
     rows: Ints
     columns: Ints
@@ -127,7 +127,7 @@ def _add(batch: list[NDArray[Any]], total: StackSums) -> tuple[Ints, Ints]:
     def add(band: slice) -> tuple[NDArray[np.uint32], Ints]:
         columns, found = np.zeros((BATCH, n_x), np.uint32), np.zeros(3, np.int64)
         _kernels.add_frames(
-            *batch, n_frames, band.start, band.stop, total.centre, total.sums, total.squares, rows, columns, found
+            *batch, n_frames, band.start, band.stop, total.centre, total.sums, total.squares_dn2, rows, columns, found
         )
         return columns, found
 
@@ -228,7 +228,7 @@ class StackStatistics:
         def fill(band: slice) -> None:
             # Squares of the deviations from the mean of the row, about their mean.
             mean = total.sums[band] - (n * total.centre + off_sum[band])
-            residual = total.squares[band] / n_x + off_squares[band] - mean**2 / n
+            residual = total.squares_dn2[band] / n_x + off_squares[band] - mean**2 / n
             residual /= n - 1
             if n_x > MIN_COLUMNS:
                 # The mean of a row contains the pixel: its deviation has the variance (1 - 2 / n_x) v + (mean of v over the
