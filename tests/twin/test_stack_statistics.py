@@ -33,6 +33,8 @@ def assert_sums(total, frames):
     np.testing.assert_array_equal(
         total.squares_dn2, (off * (off.shape[2] * off - 2 * off.sum(axis=2, keepdims=True))).sum(axis=0)
     )
+    for counts, j in zip(total.counts, np.arange(len(total.counts)) * codes.shape[2] // len(total.counts), strict=True):
+        np.testing.assert_array_equal(counts, np.bincount(codes[:, ::2, j].ravel(), minlength=codes.max() + 1))
     assert total.found.tolist() == [(codes == 0).sum(), codes.max(), np.bitwise_or.reduce(codes, axis=None)]
 
 

@@ -95,7 +95,6 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
                 if codes.shape != total.sums.shape:
                     sizes = f"{_size(total.sums.shape)} and {_size(codes.shape)}"
                     raise ParameterError("frames", f"must have the same size, but {name} has frames of {sizes}")
-            _count(batch, total.counts)
             of_rows, of_columns = _add(batch, total)
             rows.append(of_rows)
             columns.append(of_columns)
@@ -123,34 +122,23 @@ def _add(batch: list[NDArray[Any]], total: StackSums) -> tuple[Ints, Ints]:
         batch = [codes.astype(np.uint16, copy=False) for codes in batch]
     batch = batch + [np.zeros((n_y, n_x), batch[0].dtype)] * (BATCH - n_frames)
     rows = np.zeros((BATCH, n_y), np.int64)
+    chosen = np.arange(len(total.counts)) * n_x // len(total.counts)
+    samples = np.empty((BATCH, -(-n_y // 2), chosen.size), np.uint16)
 
     def add(band: slice) -> tuple[NDArray[np.uint32], Ints]:
         columns, found = np.zeros((BATCH, n_x), np.uint32), np.zeros(3, np.int64)
         _kernels.add_frames(
-            *batch, n_frames, band.start, band.stop, total.centre, total.sums, total.squares_dn2, rows, columns, found
-        )
+            *batch, n_frames, band.start, band.stop, total.centre, total.sums, total.squares_dn2, rows, columns, found, chosen,
+            samples,
+        )  # fmt: skip
         return columns, found
 
     columns = np.zeros((n_frames, n_x), np.int64)
     for of_columns, (n_zeros, highest, bits) in parallel_map(add, _bands(n_y, n_x), thread_count()):
         columns += of_columns[:n_frames]
         total.found[:] = total.found[0] + n_zeros, max(total.found[1], highest), total.found[2] | bits
+    _kernels.count_codes(samples[:n_frames], total.counts)
     return rows[:n_frames], columns
-
-
-def _count(batch: list[NDArray[Any]], counts: NDArray[np.uint32]) -> None:
-    """Count the codes of some columns, each in one thread."""
-    from foveasim.twin.frames import _kernels
-
-    n_x = batch[0].shape[1]
-    columns = np.arange(len(counts)) * n_x // len(counts)
-
-    def count(part: slice) -> None:
-        for codes in batch:
-            _kernels.count_codes(codes, columns[part], counts[part])
-
-    step = -(-len(counts) // thread_count())
-    parallel_map(count, [slice(first, first + step) for first in range(0, len(counts), step)], thread_count())
 
 
 def _bands(n_y: int, n_x: int) -> list[slice]:
@@ -253,9 +241,9 @@ class StackStatistics:
     @property
     def variance_dn2(self) -> Floats:
         """
-        Variance over frames of the deviation from the mean of the row, (n_y, n_x) float64, DN²; computed by each access.
+        Variance over frames without what rows and frames share, (n_y, n_x) float64, DN².
 
-        It is without what rows and frames share.
+        It is that of the deviation from the mean of the row, computed by each access.
         """
         return self.variances.astype(np.float64)
 
