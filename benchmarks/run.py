@@ -31,6 +31,7 @@ from angular import bench_angular
 from dense import EXPOSURE_S, bench_dense
 from exploring import bench_exploring
 from field_modes import bench_field_modes
+from frames import bench_frames
 from gradients import bench_gradients
 from kernels import bench_first_capture, bench_kernels
 from learning import bench_learning, bench_stored
@@ -454,6 +455,7 @@ def benchmarks(*, is_quick: bool) -> list[tuple[Callable[..., object], tuple[obj
         (bench_video, (n_side,)),
         (bench_learning, (n_side,)),
         (bench_stored, (n_side,)),
+        (bench_frames, ((750, 1000) if is_quick else (3000, 4000),)),
         (bench_exploring, (10 if is_quick else 40,)),
         (bench_looking, (20_000 if is_quick else 1_000_000,)),
         (bench_import, ()),

@@ -69,6 +69,7 @@ INDEPENDENT = {
     "test_cli_explore.py",
     "test_principal_point.py",
     "test_invariants.py",
+    "test_stack_statistics.py",
 }
 
 

@@ -130,7 +130,7 @@ def read_header(
     file: IO[bytes], n_bytes: int, check: Callable[[tuple[int, ...], np.dtype[Any]], None] | None = None
 ) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """
-    Read shape, whether the order is that of Fortran, and dtype of an array in the ``.npy`` format.
+    Read shape, whether the order is that of Fortran, and dtype of a ``.npy`` file.
 
     Parameters and errors are those of :func:`read_array`.
     """
@@ -151,8 +151,8 @@ def read_header(
 
 
 def read_into(file: IO[bytes], array: NDArray[Any]) -> None:
-    """Fill a C-contiguous array with the next bytes of a file; raise ValueError when there are fewer."""
-    target = memoryview(array.reshape(-1).view(np.uint8))
+    """Fill a C-contiguous array from a file; raise ValueError when that is too short."""
+    target = array.reshape(-1).view(np.uint8).data
     n_read = 0
     while n_read < len(target) and (n := file.readinto(target[n_read : n_read + CHUNK_BYTES])):  # type: ignore[attr-defined]
         n_read += n

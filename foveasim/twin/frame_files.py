@@ -80,7 +80,7 @@ def _frames(path: Path, suffix: str) -> Iterator[NDArray[Any]]:
 
 
 def _npy(path: Path) -> Iterator[NDArray[Any]]:
-    """Yield the arrays of a ``.npy`` file, read one after the other unless their numbers are mixed."""
+    """Yield the frames of a ``.npy`` file, read one by one unless they are interleaved."""
     n_bytes = path.stat().st_size
     with path.open("rb") as file:
         shape, is_fortran, dtype = read_header(file, n_bytes)

@@ -6,7 +6,7 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
-from foveasim._core.jit.types import array_of
+from foveasim._core.jit.types import INTS, array_of
 
 #: Codes whose sum has 32 bits.
 MAX_SUMMED = 1 << 16
@@ -19,20 +19,23 @@ _any = types.Array(types.float64, 2, "A", readonly=True)
     [
         types.void(
             *[codes] * 8, types.int64, types.int64, types.int64, types.float64, types.uint32[:, ::1], types.float64[:, ::1],
-            types.int64[:, ::1], types.uint32[:, ::1], types.int64[::1],
+            types.int64[:, ::1], types.uint32[:, ::1], types.int64[::1], INTS, types.uint16[:, :, ::1],
         )
         for codes in _codes
     ],
     allocates=False,
     fastmath={"contract"},
 )  # fmt: skip
-def add_frames(a, b, c, d, e, f, g, h, n_frames, first, last, centre, sums, squares, rows, columns, found):
+def add_frames(
+    a, b, c, d, e, f, g, h, n_frames, first, last, centre, sums, squares, rows, columns, found, chosen, samples
+):
     """
-    Add rows ``first`` to ``last`` of the codes (n_y, n_x) of eight frames to the sums of pixels and lines.
+    Add rows ``first`` to ``last`` of eight frames to the sums of pixels and lines.
 
-    Only ``n_frames`` of them count; the others must be 0. ``sums`` and ``squares`` (n_y, n_x) are those of
-    ``StackSums``, with ``centre``. ``rows`` (8, n_y), ``columns`` (8, n_x): sums of lines. ``found`` (3,): number of zeros,
-    highest code, and bits that occur.
+    Codes are (n_y, n_x). Only ``n_frames`` frames count; the others must be 0. ``sums`` and ``squares`` (n_y, n_x): ``sums``
+    and ``squares_dn2`` of ``StackSums``, with ``centre``. ``rows`` (8, n_y), ``columns`` (8, n_x): sums of lines. ``found``
+    (3,): number of zeros, highest code, and bits that occur. ``samples`` (8, n_row, n_column): codes of every second row in
+    ``chosen`` columns.
 
     Sums of pixels are read and written once for all frames, whose rows then are in the cache.
     """
@@ -49,6 +52,9 @@ def add_frames(a, b, c, d, e, f, g, h, n_frames, first, last, centre, sums, squa
                     of_part[x] = np.uint32(of_part[x] + part[x])
                     total = np.uint32(total + part[x])
                 rows[k, y] += total
+            if y % 2 == 0:
+                for j in range(chosen.size):
+                    samples[k, y // 2, j] = codes[chosen[j]]
             lowest, highest, bits = codes[0], codes[0], np.uint16(0)
             for x in range(n_x):
                 lowest, highest = min(lowest, codes[x]), max(highest, codes[x])
@@ -87,12 +93,13 @@ def add_frames(a, b, c, d, e, f, g, h, n_frames, first, last, centre, sums, squa
             squares_y[x] += (ab + cd) + (ef + gh)
 
 
-@njit([types.void(codes, array_of(types.int64, 1), types.uint32[:, ::1]) for codes in _codes], allocates=False)
-def count_codes(codes, columns, counts):
-    """Count the codes (n_y, n_x) of every second row in some columns, (n_column, n_code)."""
-    for y in range(0, codes.shape[0], 2):
-        for j in range(columns.size):
-            counts[j, codes[y, columns[j]]] += np.uint32(1)
+@njit(types.void(array_of(types.uint16, 3), types.uint32[:, ::1]), allocates=False)
+def count_codes(samples, counts):
+    """Count codes (n_frame, n_row, n_column) in each column, (n_column, n_code)."""
+    for k in range(samples.shape[0]):
+        for y in range(samples.shape[1]):
+            for j in range(samples.shape[2]):
+                counts[j, samples[k, y, j]] += np.uint32(1)
 
 
 @njit(

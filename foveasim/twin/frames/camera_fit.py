@@ -163,7 +163,7 @@ def _statistics(name: str, stack: Stack, bits: int, resume: Path | None) -> Stac
 def _stored(path: Path) -> StackStatistics | None:
     """Return stored statistics, None if there are none that can be read."""
     try:
-        arrays = read_archive(path)[1]
+        arrays: dict[str, Any] = read_archive(path)[1]
         return StackStatistics(**arrays | {"n_frames": int(arrays["n_frames"])})
     except (FoveasimError, KeyError, TypeError, ValueError, OSError, BadZipFile):
         return None

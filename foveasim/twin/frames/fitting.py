@@ -416,7 +416,7 @@ class _Fit:
         values = fit.values
         used = np.flatnonzero(self.is_used)
         self.dark_slope = gain = values["gain_dn_per_e"]
-        bend = 2.0 * values.get("nonlinearity_fraction", 0.0) * gain / self.adc.n_codes
+        bend_per_e = 2.0 * values.get("nonlinearity_fraction", 0.0) * gain / self.adc.n_codes
         offset, noise = self._mean_of(self.shortest), self._noise_of(self.shortest)
         self.offset_dn = self._centred(offset)
         self.offset_noise = noise
@@ -430,7 +430,7 @@ class _Fit:
             and self.levels.mean_dn[k] < LINEAR_FRACTION * (self.adc.n_codes - 1)
             and np.isnan(self.fixed_e[k])
         ]
-        self._measure_responses(fit, bright, bend)
+        self._measure_responses(fit, bright, bend_per_e)
         self.has_response = bool(bright)
         prnu = self._spatial(self.response, self.response_noise)
         dsnu = self._spatial(self.offset_dn, noise, self._line_noise())
@@ -454,27 +454,30 @@ class _Fit:
             ),
         )
 
-    def _measure_responses(self, fit: PooledFit, bright: list[int], bend: float) -> None:
+    def _measure_responses(self, fit: PooledFit, bright: list[int], bend_per_e: float) -> None:
         """Measure responses of pixels by levels, with their variances by temporal noise."""
-        gain, shape = self.dark_slope, self.classes.shape
-        response, total = np.zeros(shape), np.zeros(shape)
-        of_offset, response_noise = np.zeros(shape), np.zeros(shape)
+        gain, classes = self.dark_slope, self.classes
+        response, response_noise = np.zeros(classes.shape), np.zeros(classes.shape)
+        of_offset, total = np.zeros(self.n_classes), np.zeros(self.n_classes)
         for k in bright:
-            stack = self.linear[int(self.levels.stack[k])]
-            mean_dn, variance_dn2 = stack.mean_dn, stack.variance_dn2
-            own = self.classes == self.levels.class_of_level[k]
-            slope = 1.0 - bend * float(fit.light_e[k])
+            stack, c = self.linear[int(self.levels.stack[k])], int(self.levels.class_of_level[k])
+            mean_dn, variance_dn2, own = stack.mean_dn, stack.variance_dn2, classes == c
+            slope = 1.0 - bend_per_e * float(fit.light_e[k])
             signal = gain * slope * float(fit.light_e[k])
             weight = signal**2 * stack.n_frames / max(float(variance_dn2.mean(where=own)), 1e-6)
             mean_dn -= float(mean_dn.mean(where=own)) + slope * self.offset_dn
-            np.add(response, weight / signal * mean_dn, out=response, where=own)
-            np.add(response_noise, weight**2 / stack.n_frames / signal**2 * variance_dn2, out=response_noise, where=own)
-            np.add(of_offset, weight * slope / signal, out=of_offset, where=own)
-            np.add(total, weight, out=total, where=own)
-        has = total > 0.0
-        total = np.where(has, total, 1.0)
-        self.response = np.where(has, response / total, 0.0)
-        self.response_noise = (response_noise / total**2) + (of_offset / total) ** 2 * self.offset_noise
+            mean_dn *= own * (weight / signal)
+            variance_dn2 *= own * (weight**2 / stack.n_frames / signal**2)
+            response += mean_dn
+            response_noise += variance_dn2
+            of_offset[c] += weight * slope / signal
+            total[c] += weight
+        # The last one is that of defects, whose class is -1.
+        scale = np.append(np.divide(1.0, total, out=np.zeros_like(total), where=total > 0.0), 0.0)[classes]
+        self.response = response * scale
+        self.response_noise = (
+            response_noise * scale**2 + (np.append(of_offset, 0.0)[classes] * scale) ** 2 * self.offset_noise
+        )
 
     def _dark_spread(self) -> DarkSpread | None:
         """Return the distribution of the dark current over pixels, in e-/s."""

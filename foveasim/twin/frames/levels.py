@@ -61,7 +61,7 @@ class Levels:
         return self.variances_dn2 @ self.weights
 
     @classmethod
-    def of(cls, stacks: list[StackStatistics], classes: Ints, share: Floats | float = 1.0) -> Levels:
+    def of(cls, stacks: list[StackStatistics], classes: NDArray[Any], share: Floats | float = 1.0) -> Levels:
         """
         Return the levels of stacks for classes of pixels.
 
@@ -83,17 +83,17 @@ class Levels:
         return cls(**{name: np.array(each) for name, each in rows.items()}, weights=weights)
 
 
-def _blocks(classes: Ints) -> Ints:
+def _blocks(classes: NDArray[Any]) -> Ints:
     return row_blocks(classes.shape[0], unit=2 if classes.max() else 1)
 
 
-def block_weights(classes: Ints) -> Floats:
+def block_weights(classes: NDArray[Any]) -> Floats:
     """Return the fractions of the pixels in each block, (n_block,)."""
     blocks = _blocks(classes)
     return np.bincount(blocks) / blocks.size
 
 
-def block_means(values: Floats, classes: Ints, share: Floats | float = 1.0) -> Floats:
+def block_means(values: Floats, classes: NDArray[Any], share: Floats | float = 1.0) -> Floats:
     """Return the weighted means of pixels over each class and block, (n_class, n_block)."""
     from foveasim.twin.frames import _kernels
 

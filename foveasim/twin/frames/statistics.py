@@ -34,6 +34,8 @@ MAX_SUMMED = 1 << 16
 COUNTED, N_CODES = 64, 1 << 16
 #: Frames that are added at once, with one access to the sums of pixels.
 BATCH = 8
+#: Name of the threads that read frames.
+READER = "foveasim-frames"
 #: Pixels of the rows that a thread adds at a time.
 BAND_PIXELS = 1 << 18
 
@@ -43,14 +45,14 @@ class StackSums:
     """
     Sums over the frames of a stack.
 
-    ``sums`` (n_y, n_x) uint32 or int64: of codes. ``squares`` (n_y, n_x) float64, whole numbers: of d (n_x d - 2 t), with
+    ``sums`` (n_y, n_x) uint32 or int64: of codes. ``squares_dn2`` (n_y, n_x) float64, whole numbers: of d (n_x d - 2 t), with
     differences d from ``centre``, and their sums t in the row. ``rows`` (n_frame, n_y), ``columns`` (n_frame, n_x) int64: sums
     of codes in lines. ``found`` (3,): number of zeros, highest code, and bits that occur. ``counts``: see
     :class:`StackStatistics`.
     """
 
-    sums: Ints
-    squares: Floats
+    sums: NDArray[Any]
+    squares_dn2: Floats
     centre: float
     rows: Ints
     columns: Ints
@@ -61,10 +63,11 @@ class StackSums:
     def zeros(cls, like: NDArray[Any]) -> StackSums:
         """Return sums over no frames, for frames as one of a stack."""
         (n_y, n_x), sample = like.shape, like[:: max(1, like.shape[0] // 64)]
-        lines = (np.zeros((0, n), np.int64) for n in (n_y, n_x))
-        sums, squares = np.zeros(like.shape, np.uint32), np.zeros(like.shape)
+        rows, columns = (np.zeros((0, n), np.int64) for n in (n_y, n_x))
+        sums: NDArray[Any] = np.zeros(like.shape, np.uint32)
+        centre, found = float(np.rint(sample.mean())), np.zeros(3, np.int64)
         counts = np.zeros((min(n_x, COUNTED), N_CODES), np.uint32)
-        return cls(sums, squares, float(np.rint(sample.mean())), *lines, np.zeros(3, np.int64), counts)
+        return cls(sums, np.zeros(like.shape), centre, rows, columns, found, counts)
 
 
 def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
@@ -83,7 +86,7 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
     total: StackSums | None = None
     whole: Ints | None = None
     rows, columns, n_frames = [], [], 0
-    with ThreadPoolExecutor(1) as reader:
+    with ThreadPoolExecutor(1, thread_name_prefix=READER) as reader:
         ahead = reader.submit(read)
         while batch := ahead.result():
             ahead = reader.submit(read)
@@ -92,13 +95,12 @@ def sum_frames(name: str, frames: Iterable[NDArray[Any]]) -> StackSums:
                 if codes.shape != total.sums.shape:
                     sizes = f"{_size(total.sums.shape)} and {_size(codes.shape)}"
                     raise ParameterError("frames", f"must have the same size, but {name} has frames of {sizes}")
-            _count(batch, total.counts)
             of_rows, of_columns = _add(batch, total)
             rows.append(of_rows)
             columns.append(of_columns)
             n_frames += len(batch)
             if n_frames % MAX_SUMMED == 0:  # more would exceed 32 bits
-                whole = total.sums + (0 if whole is None else whole)
+                whole = total.sums.astype(np.int64) + (0 if whole is None else whole)
                 total.sums[:] = 0
     if total is None or n_frames < 2:
         raise ParameterError(
@@ -120,34 +122,23 @@ def _add(batch: list[NDArray[Any]], total: StackSums) -> tuple[Ints, Ints]:
         batch = [codes.astype(np.uint16, copy=False) for codes in batch]
     batch = batch + [np.zeros((n_y, n_x), batch[0].dtype)] * (BATCH - n_frames)
     rows = np.zeros((BATCH, n_y), np.int64)
+    chosen = np.arange(len(total.counts)) * n_x // len(total.counts)
+    samples = np.empty((BATCH, -(-n_y // 2), chosen.size), np.uint16)
 
-    def add(band: slice) -> tuple[Ints, Ints]:
+    def add(band: slice) -> tuple[NDArray[np.uint32], Ints]:
         columns, found = np.zeros((BATCH, n_x), np.uint32), np.zeros(3, np.int64)
         _kernels.add_frames(
-            *batch, n_frames, band.start, band.stop, total.centre, total.sums, total.squares, rows, columns, found
-        )
+            *batch, n_frames, band.start, band.stop, total.centre, total.sums, total.squares_dn2, rows, columns, found, chosen,
+            samples,
+        )  # fmt: skip
         return columns, found
 
     columns = np.zeros((n_frames, n_x), np.int64)
     for of_columns, (n_zeros, highest, bits) in parallel_map(add, _bands(n_y, n_x), thread_count()):
         columns += of_columns[:n_frames]
         total.found[:] = total.found[0] + n_zeros, max(total.found[1], highest), total.found[2] | bits
+    _kernels.count_codes(samples[:n_frames], total.counts)
     return rows[:n_frames], columns
-
-
-def _count(batch: list[NDArray[Any]], counts: NDArray[np.uint32]) -> None:
-    """Count the codes of some columns, each in one thread."""
-    from foveasim.twin.frames import _kernels
-
-    n_x = batch[0].shape[1]
-    columns = np.arange(len(counts)) * n_x // len(counts)
-
-    def count(part: slice) -> None:
-        for codes in batch:
-            _kernels.count_codes(codes, columns[part], counts[part])
-
-    step = -(-len(counts) // thread_count())
-    parallel_map(count, [slice(first, first + step) for first in range(0, len(counts), step)], thread_count())
 
 
 def _bands(n_y: int, n_x: int) -> list[slice]:
@@ -204,7 +195,7 @@ class StackStatistics:
     """
 
     n_frames: int
-    sums: Ints
+    sums: NDArray[Any]
     variances: NDArray[np.float32]
     row_dn: Floats
     column_dn: Floats
@@ -225,7 +216,7 @@ class StackStatistics:
         def fill(band: slice) -> None:
             # Squares of the deviations from the mean of the row, about their mean.
             mean = total.sums[band] - (n * total.centre + off_sum[band])
-            residual = total.squares[band] / n_x + off_squares[band] - mean**2 / n
+            residual = total.squares_dn2[band] / n_x + off_squares[band] - mean**2 / n
             residual /= n - 1
             if n_x > MIN_COLUMNS:
                 # The mean of a row contains the pixel: its deviation has the variance (1 - 2 / n_x) v + (mean of v over the
@@ -250,9 +241,9 @@ class StackStatistics:
     @property
     def variance_dn2(self) -> Floats:
         """
-        Variance over frames of the deviation from the mean of the row, (n_y, n_x) float64, DN²; computed by each access.
+        Variance over frames without what rows and frames share, (n_y, n_x) float64, DN².
 
-        It is without what rows and frames share.
+        It is that of the deviation from the mean of the row, computed by each access.
         """
         return self.variances.astype(np.float64)
 
