@@ -200,7 +200,7 @@ def test_dark_currents_beside_row_noise_and_saturation():
     np.testing.assert_allclose(found.maps["dark_e_per_s"].flat[hot], dark.flat[hot], rtol=0.02)
 
 
-def test_hidden_spread_of_dark_current_has_a_limit():
+def test_hidden_spread_of_currents_is_limited():
     """Equal currents of all pixels: the interval begins at 0."""
     rng = np.random.default_rng(12)
 

@@ -68,7 +68,11 @@ def fit_code_widths(histograms: Sequence[Ints]) -> Estimate | Uncertain:
 
 
 def _third_differences(counts: Ints) -> tuple[Floats, Floats] | None:
-    """Return squares of third differences of the relative counts of a column less Poisson noise, and weights, or None."""
+    """
+    Return squares of third differences of the counts of a column, and their weights.
+
+    The counts are relative to their density, and the squares without Poisson noise. None without enough counts.
+    """
     total = int(counts.sum())
     if total < MIN_COUNT:
         return None
@@ -90,7 +94,9 @@ def _third_differences(counts: Ints) -> tuple[Floats, Floats] | None:
 
 def _mean_squares(offset_dn: Floats) -> Floats:
     """
-    Return the mean squares of third differences of code widths, for standard deviations of the offsets of codes.
+    Return the mean squares of third differences of code widths.
+
+    ``offset_dn``: standard deviations of the offsets of codes.
 
     An offset d moves the fraction 1 - f of the samples of a code by m codes and the fraction f by m + 1 codes, with the whole
     part m and the fraction f of d. Fractions of different codes are independent.
