@@ -690,7 +690,7 @@ class _Fit:
         return float(brentq(above, low, high, rtol=1e-6)) if above(low) * above(high) < 0.0 else guess
 
     def _hot_currents(self, fit: PooledFit) -> Floats:
-        """Return dark currents of hot pixels, (n_hot,) e-/s; NaN without two levels below saturation."""
+        """Return dark currents of hot pixels below saturation, (n_hot,) e-/s, or NaN."""
         values = fit.values
         top_e = min(values.get("full_well_e", math.inf), 1.1 * self.adc.n_codes / self.dark_slope)
         charges_e = top_e * np.linspace(0.0, 1.0, N_CHARGES) ** 2
