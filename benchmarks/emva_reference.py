@@ -4,8 +4,8 @@ The same frames in the reference implementation of EMVA 1288, in ``fs.metrics.em
     python benchmarks/emva_reference.py             a table of the parameters
     python benchmarks/emva_reference.py FOLDER      the same, and leaves frames and descriptor in the folder
 
-The frames are Poisson and Gaussian numbers, without the package: pairs with and without light for 50 exposure times up to beyond
-saturation, and stacks of 32 frames at half saturation. The reference reads them by its descriptor file.
+The frames are Poisson and Gaussian numbers, without the package: pairs with and without light for 50 exposure times, up to
+beyond saturation, and stacks of 32 frames at half saturation. The reference reads them by its descriptor file.
 """
 
 from __future__ import annotations
