@@ -55,6 +55,20 @@ def test_parameters_agree_in_seven_digits(compared):
         assert row.own == pytest.approx(row.reference, rel=5e-8), row.title
 
 
+def test_table_of_guide_is_current(compared):
+    """The columns of the frames, of the reference and of ``emva1288``; those of the twin are within their intervals."""
+    rows = compared.module.rows_of(compared.reference, (compared.temporal, compared.spatial), compared.twin.estimates)
+    printed = [line.split("|")[1:-1] for line in compared.module.table_of(rows).splitlines()]
+    guide = (ROOT / "docs" / "guides" / "your_camera.md").read_text()
+    start = guide.index("| parameter | drawn |")
+    shown = [line.split("|")[1:-1] for line in guide[start : guide.index("\n\n", start)].splitlines()]
+
+    assert [cells[:4] for cells in shown] == [cells[:4] for cells in printed]
+    for row, cells in zip(rows, shown[2:], strict=True):
+        assert (row.twin is None) == (not cells[4].strip())
+        assert row.twin is None or row.twin[1] <= float(cells[4]) <= row.twin[2]
+
+
 def test_parts_agree_by_formulas_of_standard(compared):
     """
     Equations (41) and following divide squares of means by the numbers of rows and columns, instead of the degrees of freedom.
