@@ -64,7 +64,7 @@ class Spread:
 
     @cached_property
     def pixels(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Responses, offsets (e-), factors of the dark current, and weights of some pixels, (n,) each."""
+        """Responses, offsets (e-), factors of dark current, and weights, (n,) each."""
         if not (self.response_fraction or self.offset_e or self.dark_fraction):
             return np.ones(1), np.zeros(1), np.ones(1), np.ones(1)
         normal, weights = _lattice() if self.response_fraction else _lattice(())
@@ -76,10 +76,10 @@ class Spread:
 
 
 @cache
-def _lattice(tail: tuple[float, ...] = TAIL) -> tuple[Floats, Floats]:
-    """Return normal numbers of pixels, (3, n), with mean 0 and variance 1 by their weights, (n,)."""
+def _lattice(tail_fraction: tuple[float, ...] = TAIL) -> tuple[Floats, Floats]:
+    """Return normal numbers of pixels, (3, n), and their weights, (n,)."""
     k = np.arange(N_PIXELS)
-    parts = np.array([0.0, *tail, 1.0]) / N_PIXELS
+    parts = np.array([0.0, *tail_fraction, 1.0]) / N_PIXELS
     edges = np.concatenate((parts, k[2:-1] / N_PIXELS, 1.0 - parts[::-1]))
     weights = np.diff(edges)
     pixel = np.concatenate((np.zeros(parts.size - 1, np.int64), k[1:-1], np.full(parts.size - 1, k[-1])))
