@@ -106,6 +106,7 @@ bench-torch: $(TORCH_VENV)/.installed
 peers: $(VENV)/.installed-dev
 	$(BIN)/python $(INSTALL) --editable '.[peers]'
 	$(BIN)/python benchmarks/peers.py
+	$(BIN)/python benchmarks/emva_reference.py
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --builder html docs docs/_build/html

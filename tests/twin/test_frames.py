@@ -129,6 +129,25 @@ def test_missing_dark_series_is_said(twin):
     assert any("dark current is part of the black level" in text for text in twin.assumptions)
 
 
+def test_level_with_few_pixels_below_full_well():
+    """Its variance is that of the few pixels of low response, which no equally probable pixels represent."""
+    rng = np.random.default_rng(3)
+    response = 1.0 + 0.01 * rng.normal(size=(96, 64))
+
+    def frames(signal_e, n=8):
+        charge = np.minimum(rng.poisson(signal_e * response, (n, *response.shape)), 30_000)
+        return np.rint(1.5 * (charge + rng.normal(0.0, 2.0, charge.shape)) + 100.0).astype(np.uint16)
+
+    stacks = [fs.twin.Stack(frames(0.0, 32), 1e-3, light=0)]
+    stacks += [fs.twin.Stack(frames(3.12e6 * time_s), time_s, light=1) for time_s in 1e-3 * np.arange(1, 12)]
+    found = fs.twin.fit(stacks, bits=16, pixel_um=3.0)
+
+    assert found.chi_square_ratio < 2.0
+    for name, value in (("gain_dn_per_e", 1.5), ("read_noise_e", 2.0), ("full_well_e", 30_000.0)):
+        each = found.estimates[name]
+        assert abs(each.value - value) < each.high - each.low, name
+
+
 def test_unknown_light_is_enough_for_the_gain():
     """Photon transfer needs no exposure times: each level has its own charge."""
     known = numpy_stacks(0.4, 4.0, 60.0, 8000.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,9 @@ __all__ = ["Chain", "Spread"]
 #: Pixels that represent all: a lattice of rank 1, whose responses, offsets and dark currents are equally probable each, and the
 #: steps of the lattice with the smallest correlations.
 N_PIXELS, LATTICE = 31, (1, 22, 10)
+#: Parts of the probability of the lowest and highest response at which these pixels are divided: the few pixels that are not
+#: full determine the variance of levels above the full well.
+TAIL = (1 / 256, 1 / 64, 1 / 16, 1 / 4, 1 / 2)
 #: Relative difference of spreads up to which they have the same effect.
 SAME_SPREAD = 0.02
 #: Largest nonlinearity in a search.
@@ -59,15 +63,30 @@ class Spread:
         return bool(np.allclose(mine, others, rtol=SAME_SPREAD))
 
     @cached_property
-    def pixels(self) -> tuple[Floats, Floats, Floats]:
-        """Responses, offsets (e-) and factors of the dark current of some pixels, (n,) each."""
+    def pixels(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Responses, offsets (e-), factors of dark current, and weights, (n,) each."""
         if not (self.response_fraction or self.offset_e or self.dark_fraction):
-            return np.ones(1), np.zeros(1), np.ones(1)
-        normal = ndtri((np.multiply.outer(LATTICE, np.arange(N_PIXELS)) % N_PIXELS + 0.5) / N_PIXELS)
-        response, offset, dark = normal / normal.std(axis=1, keepdims=True)
+            return np.ones(1), np.zeros(1), np.ones(1), np.ones(1)
+        normal, weights = _lattice() if self.response_fraction else _lattice(())
+        response, offset, dark = normal
         sigma = math.sqrt(math.log1p(self.dark_fraction**2))
         factor = np.exp(sigma * dark)
-        return np.maximum(1.0 + self.response_fraction * response, 0.0), self.offset_e * offset, factor / factor.mean()
+        responses = np.maximum(1.0 + self.response_fraction * response, 0.0)
+        return responses, self.offset_e * offset, factor / (factor @ weights), weights
+
+
+@cache
+def _lattice(tail_fraction: tuple[float, ...] = TAIL) -> tuple[Floats, Floats]:
+    """Return normal numbers of pixels, (3, n), and their weights, (n,)."""
+    k = np.arange(N_PIXELS)
+    parts = np.array([0.0, *tail_fraction, 1.0]) / N_PIXELS
+    edges = np.concatenate((parts, k[2:-1] / N_PIXELS, 1.0 - parts[::-1]))
+    weights = np.diff(edges)
+    pixel = np.concatenate((np.zeros(parts.size - 1, np.int64), k[1:-1], np.full(parts.size - 1, k[-1])))
+    normal = ndtri((np.multiply.outer(LATTICE, pixel) % N_PIXELS + 0.5) / N_PIXELS)
+    normal[0] = -np.diff(np.exp(-0.5 * ndtri(edges) ** 2)) / weights  # means between the edges, but for a factor
+    normal -= (normal @ weights)[:, None]
+    return normal / np.sqrt(normal**2 @ weights)[:, None], weights
 
 
 class Moments(NamedTuple):
@@ -75,13 +94,14 @@ class Moments(NamedTuple):
     Moments of codes at several levels.
 
     ``mean_dn``, ``variance_dn2``, ``slope_dn_per_e`` (n_level,): in the mean over pixels; the slope is that of the mean code by
-    the charge. ``of_pixels`` (2 n_level, n): means, then variances, of pixels that represent all.
+    the charge. ``of_pixels`` (2 n_level, n): means, then variances, of pixels that represent all, with ``weights`` (n,).
     """
 
     mean_dn: Floats
     variance_dn2: Floats
     slope_dn_per_e: Floats
     of_pixels: Floats
+    weights: Floats
 
     @property
     def statistics(self) -> Floats:
@@ -90,8 +110,8 @@ class Moments(NamedTuple):
 
     def sampling(self) -> Floats:
         """Return the covariance of statistics over pixels, (2 n_level, 2 n_level)."""
-        off = self.of_pixels - self.of_pixels.mean(axis=1, keepdims=True)
-        return np.asarray(off @ off.T / off.shape[1])
+        off = self.of_pixels - self.statistics[:, None]
+        return np.asarray((self.weights * off) @ off.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +148,7 @@ class Chain:
 
     def moments(self, values: Mapping[str, float], light_e: Floats, dark_e: Floats) -> Moments:
         """Return the moments of codes for charges of light and dark current, (n_level,) e- each."""
-        responses, offset_e, factors = self.spread.pixels
+        responses, offset_e, factors, weights = self.spread.pixels
         signed_e = (np.outer(light_e, responses) + np.outer(dark_e, factors)).ravel()
         offsets_e, well_e = np.tile(offset_e, self.n_levels), values.get("full_well_e", math.inf)
         index, share, well = np.arange(signed_e.size), np.ones(signed_e.size), np.full(signed_e.size, LARGEST_E)
@@ -155,5 +175,5 @@ class Chain:
             np.bincount(index, share * each).reshape(self.n_levels, -1) for each in (mean, variance, slope)
         )
         return Moments(
-            means.mean(axis=1), variances.mean(axis=1), slopes.mean(axis=1), np.concatenate((means, variances))
+            means @ weights, variances @ weights, slopes @ weights, np.concatenate((means, variances)), weights
         )
