@@ -219,6 +219,38 @@ def test_dark_currents_beside_row_noise_and_saturation():
     np.testing.assert_allclose(found.maps["dark_e_per_s"].flat[hot], dark.flat[hot], rtol=0.02)
 
 
+def test_dark_current_is_no_telegraph_noise():
+    """Dark currents of 100 e-/s with a spread of 30 % at 10 ms: no RTS noise, and no PRNU of flats at 40 ms."""
+    rng = np.random.default_rng(15)
+    log = np.sqrt(np.log1p(0.3**2))
+    dark = 400.0 * np.exp(log * rng.normal(size=(N_Y, N_X)) - 0.5 * log**2)
+    response = 1.0 + 0.01 * rng.normal(size=(N_Y, 1)) + 0.004 * rng.normal(size=(N_Y, N_X))
+
+    def frames(light_e, time_s, n=16):
+        charge = rng.poisson(light_e * response + dark * time_s, (n, N_Y, N_X)) + rng.normal(0.0, 2.0, (n, N_Y, N_X))
+        return np.rint(0.6 * charge + 60.0).astype(np.uint16)
+
+    stacks = [
+        fs.twin.Stack(frames(0.0, time_s, n), time_s, light=0) for time_s, n in ((1e-2, 64), (0.1, 16), (0.5, 16))
+    ]
+    stacks += [fs.twin.Stack(frames(500.0 * k, 0.01 * k), 0.01 * k, light=1) for k in range(1, 11)]
+    found = fs.twin.fit(stacks, bits=12, pixel_um=3.0)
+
+    assert "rts_fraction" in found.not_identifiable
+    for name, value in (
+        ("read_noise_e", 2.0),
+        ("gain_dn_per_e", 0.6),
+        ("prnu_fraction", 0.004),
+        ("dark_e_per_s", 400.0),
+    ):
+        each = found.estimates[name]
+        assert abs(each.value - value) < each.high - each.low, name
+    rows = found.estimates["prnu_row_fraction"]
+    assert abs(rows.value - 0.01) < rows.high - rows.low < 0.005
+    assert found.estimates["prnu_column_fraction"].low == 0.0 < found.estimates["prnu_column_fraction"].high < 1e-3
+    assert found.chi_square_ratio < 2.5
+
+
 def test_hidden_spread_of_currents_is_limited():
     """Equal currents of all pixels: the interval begins at 0."""
     rng = np.random.default_rng(12)

@@ -45,8 +45,8 @@ def fit_dark_spread(slopes: Floats, noise: Floats) -> DarkSpread | None:
     """
     Fit the distribution of dark currents.
 
-    ``slopes`` (n_pixel,), in any unit, and variances of their ``noise``, in its square. None if there is no current, or no limit
-    to its spread.
+    ``slopes`` (n_pixel,), in any unit, and variances of their ``noise``, in its square. None if there is no current, or no
+    limit to its spread.
     """
     from scipy import optimize
     from scipy.special import ndtr

@@ -46,6 +46,8 @@ MAX_NONLINEARITY_ERROR = 0.1
 ROUNDS = 3
 #: Fraction of the full well above which the first fit leaves out levels.
 CLOSE_FRACTION = 0.85
+#: Smallest variance of a pixel in the dark, over the mean one.
+MIN_SHOT_RATIO = 0.2
 #: Gain above which, and read noise below which, codes of whole electrons are more frequent than those between.
 MAX_GAIN, MIN_READ_E = 0.7, 0.6
 #: Probability of RTS noise from which a pixel is left out of offsets.
@@ -207,10 +209,24 @@ class _Fit:
         if np.median(stack.variance_dn2) < MIN_DARK_DN2:
             return
         # In linear codes: the steps of pixels with different offsets are nearly equal.
-        self.telegraph = fit_telegraph(self.linear[self.telegraph_stack].variance_dn2[self.good], stack.n_frames)
+        variance_dn2 = self.linear[self.telegraph_stack].variance_dn2
+        variance_dn2 /= self._shot_ratio(variance_dn2)
+        self.telegraph = fit_telegraph(variance_dn2[self.good], stack.n_frames)
         if self.telegraph is not None:
             self.rts_probability[self.good] = self.telegraph.probability
             self.step_dn = self.telegraph.step_dn / float(self.adc.width_of_code_dn(np.median(stack.mean_dn)))
+
+    def _shot_ratio(self, variance_dn2: Floats) -> Floats | float:
+        """Return the variances that dark frames have by the shot noise of their dark current, over the mean one."""
+        if self.dark_slope_dn is None:
+            return 1.0
+        best, own = max(self.lit, key=self._brightness), self.classes == 0
+        dark, lit = self.linear[self.telegraph_stack], self.linear[best]
+        rise_dn2 = float(np.median(lit.variance_dn2[own]) - np.median(variance_dn2[own]))
+        gain = rise_dn2 / max(float(np.median(lit.mean_dn[own]) - np.median(dark.mean_dn[own])), 1e-9)
+        current_dn = np.maximum(self.dark_slope_dn, 0.0) * self.lights[self.telegraph_stack].exposure_s
+        current_dn -= current_dn.mean(where=self.good)
+        return np.maximum(1.0 + max(gain, 0.0) / float(np.median(variance_dn2[own])) * current_dn, MIN_SHOT_RATIO)
 
     def _fit_chain(self, spread: Spread, before: PooledFit | None) -> PooledFit:
         """
@@ -420,6 +436,7 @@ class _Fit:
         offset, noise = self._mean_of(self.shortest), self._noise_of(self.shortest)
         self.offset_dn = self._centred(offset)
         self.offset_noise = noise
+        self.dark_spread = dark = self._dark_spread()
         # Responses: levels below saturation, weighted by their shot noise.
         well = values.get("full_well_e", math.inf)
         bright = [
@@ -430,33 +447,46 @@ class _Fit:
             and self.levels.mean_dn[k] < LINEAR_FRACTION * (self.adc.n_codes - 1)
             and np.isnan(self.fixed_e[k])
         ]
-        self._measure_responses(fit, bright, bend_per_e)
+        line_noise = self._measure_responses(fit, bright, bend_per_e)
         self.has_response = bool(bright)
-        prnu = self._spatial(self.response, self.response_noise)
-        dsnu = self._spatial(self.offset_dn, noise, self._line_noise())
-        self.prnu, self.dsnu = prnu, dsnu
-        total_offset = math.sqrt(max(sum(dsnu[part][0] for part in ("row", "column", "pixel")), 0.0))
-        self.dark_spread = self._dark_spread()
-        weights, dark = self.levels.weights, self.dark_spread
-        prnu2, of_blocks = prnu["pixel"]
-        has_response = bool(bright) and prnu2 > 0.0
-        offset_error = math.sqrt(0.5 / self.good.sum())
-        if dsnu["pixel"][0] > 0.0:
-            offset_error = 0.5 * _error(dsnu["pixel"][1], weights) / dsnu["pixel"][0]
+        self.prnu = self._spatial(self.response, self.response_noise, line_noise)
+        self.dsnu = self._spatial(self.offset_dn, noise, self._line_noise())
+        response, response_error = self._total(self.prnu)
+        total_offset, offset_error = self._total(self.dsnu)
         return Spread(
-            math.sqrt(prnu2) if has_response else 0.0,
+            response if bright else 0.0,
             total_offset / gain,
             0.0 if dark is None else dark.fraction,
-            (
-                0.5 * _error(of_blocks, weights) / prnu2 if has_response else 0.0,
-                min(offset_error, 1.0),
-                0.0 if dark is None else dark.relative_error,
-            ),
+            (response_error, offset_error, 0.0 if dark is None else dark.relative_error),
         )
 
-    def _measure_responses(self, fit: PooledFit, bright: list[int], bend_per_e: float) -> None:
-        """Measure responses of pixels by levels, with their variances by temporal noise."""
-        gain, classes = self.dark_slope, self.classes
+    def _total(self, parts: Mapping[str, tuple[float, Any]]) -> tuple[float, float]:
+        """Return the standard deviation of rows, columns and pixels together, and its relative error, at most 1."""
+        total = sum(max(variance, 0.0) for variance, _ in parts.values())
+        if total == 0.0:
+            return 0.0, 0.0
+        errors = [_error(parts["pixel"][1], self.levels.weights)]
+        for name in ("row", "column"):
+            variance, (square, degrees, _, n) = parts[name]
+            errors.append(square / n * math.sqrt(2.0 / max(degrees, 1)) if variance > 0.0 else 0.0)
+        return math.sqrt(total), min(0.5 * math.hypot(*errors) / total, 1.0)
+
+    def _currents_dn_per_s(self) -> Floats | None:
+        """Return differences of dark currents from their mean, as far as they are known, (n_y, n_x)."""
+        if self.dark_spread is None or self.dark_slope_dn is None or self.dark_slope_noise is None:
+            return None
+        mean_dn_per_s = self.dark_spread.mean * self.dark_slope
+        share = _reliability((self.dark_spread.fraction * mean_dn_per_s) ** 2, self.dark_slope_noise)
+        return share * (self.dark_slope_dn - mean_dn_per_s)
+
+    def _measure_responses(self, fit: PooledFit, bright: list[int], bend_per_e: float) -> dict[str, float]:
+        """
+        Measure responses of pixels by levels, with their variances by temporal noise.
+
+        Returns the temporal part of mean squares of rows and columns.
+        """
+        gain, classes, currents = self.dark_slope, self.classes, self._currents_dn_per_s()
+        lines = {name: np.zeros(self.n_classes) for name in ("row", "column")}
         response, response_noise = np.zeros(classes.shape), np.zeros(classes.shape)
         of_offset, total = np.zeros(self.n_classes), np.zeros(self.n_classes)
         for k in bright:
@@ -466,10 +496,16 @@ class _Fit:
             signal = gain * slope * float(fit.light_e[k])
             weight = signal**2 * stack.n_frames / max(float(variance_dn2.mean(where=own)), 1e-6)
             mean_dn -= float(mean_dn.mean(where=own)) + slope * self.offset_dn
+            if currents is not None:
+                longer_s = float(self.exposures.exposure_s[k]) - self.lights[self.shortest[0]].exposure_s
+                mean_dn -= slope * longer_s * currents
             mean_dn *= own * (weight / signal)
             variance_dn2 *= own * (weight**2 / stack.n_frames / signal**2)
             response += mean_dn
             response_noise += variance_dn2
+            squares = stack.mean_squares_dn2
+            for name, of_class in lines.items():
+                of_class[c] += weight**2 / stack.n_frames / signal**2 * (squares[name] - squares["pixel"])
             of_offset[c] += weight * slope / signal
             total[c] += weight
         # The last one is that of defects, whose class is -1.
@@ -478,6 +514,14 @@ class _Fit:
         self.response_noise = (
             response_noise * scale**2 + (np.append(of_offset, 0.0)[classes] * scale) ** 2 * self.offset_noise
         )
+        has = total > 0.0
+        if not has.any():
+            return dict.fromkeys(lines, 0.0)
+        of_dark, offsets = self._line_noise(), float(((of_offset[has] / total[has]) ** 2).mean())
+        return {
+            name: float((of_class[has] / total[has] ** 2).mean()) + offsets * of_dark[name]
+            for name, of_class in lines.items()
+        }
 
     def _dark_spread(self) -> DarkSpread | None:
         """Return the distribution of the dark current over pixels, in e-/s."""
@@ -590,18 +634,17 @@ class _Fit:
     def _report_maps(self) -> None:
         """Collect maps of pixels, each value in proportion to its reliability."""
         gain = self.dark_slope
-        spread2 = sum(max(self.dsnu[part][0], 0.0) for part in ("row", "column", "pixel"))
+        spread2 = self._total(self.dsnu)[0] ** 2
         offset = self.offset_dn
-        if self.dark_spread is not None and self.dark_slope_dn is not None and self.dark_slope_noise is not None:
-            mean, fraction = self.dark_spread.mean * gain, self.dark_spread.fraction
-            off = _reliability((fraction * mean) ** 2, self.dark_slope_noise) * (self.dark_slope_dn - mean)
-            current = np.maximum(mean + off, 0.0) / gain
+        currents = self._currents_dn_per_s()
+        if currents is not None and self.dark_spread is not None and self.dark_slope_dn is not None:
+            current = np.maximum(self.dark_spread.mean + currents / gain, 0.0)
             current[self.is_hot] = np.fmax(self.hot_e_per_s, np.maximum(self.dark_slope_dn[self.is_hot], 0.0) / gain)
             self.maps["dark_e_per_s"] = current
-            off *= -self.lights[self.shortest[0]].exposure_s
-            off += offset
-            offset = off
-        response = 1.0 + _reliability(max(self.prnu["pixel"][0], 0.0), self.response_noise) * self.response
+            currents *= -self.lights[self.shortest[0]].exposure_s
+            currents += offset
+            offset = currents
+        response = 1.0 + _reliability(self._total(self.prnu)[0] ** 2, self.response_noise) * self.response
         self.maps |= {
             "offset_e": np.where(self.good, _reliability(spread2, self.offset_noise) * offset, 0.0) / gain,
             "response_fraction": np.where(self.is_dead, 0.0, np.where(self.good, response, 1.0)),
@@ -721,8 +764,11 @@ class _Fit:
         if self.has_response:
             pixel, of_blocks = self.prnu["pixel"]
             found["prnu_fraction"] = of_variance(pixel, _error(of_blocks, weights), blocks)
+            for name in ("row", "column"):
+                found[f"prnu_{name}_fraction"] = of_squares(*self.prnu[name][1])
         else:
-            found["prnu_fraction"] = Uncertain("no level is between the dark and the saturation")
+            names = ("prnu_fraction", "prnu_row_fraction", "prnu_column_fraction")
+            found |= dict.fromkeys(names, Uncertain("no level is between the dark and the saturation"))
 
     def _report_lines(self) -> None:
         scale = self.dark_slope**2

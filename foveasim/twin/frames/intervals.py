@@ -67,7 +67,9 @@ def of_squares(square: float, degrees: int, other: float, n: int) -> Estimate:
     """
     from scipy.special import chdtri
 
-    low, high = (square * degrees / float(chdtri(degrees, tail)) for tail in (TAIL, 1.0 - TAIL))
+    low = square * degrees / float(chdtri(degrees, TAIL))
+    # A mean square below that of pixels is one of no lines at least: the upper limit is not 0.
+    high = max(square, other) * degrees / float(chdtri(degrees, 1.0 - TAIL))
     return Estimate(*(math.sqrt(max((each - other) / n, 0.0)) for each in (square, low, high)))
 
 

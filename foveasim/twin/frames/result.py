@@ -47,8 +47,8 @@ class Twin:
     Attributes
     ----------
     estimates : mapping of str to Estimate
-        Parameters, each with an interval of 95 % confidence. ``dsnu_e`` is that of pixels, without rows and columns;
-        ``black_level_dn`` is the mean code of a dark frame of exposure 0, in codes of a linear ADC.
+        Parameters, each with an interval of 95 % confidence. ``dsnu_e`` and ``prnu_fraction`` are those of pixels, without
+        rows and columns; ``black_level_dn`` is the mean code of a dark frame of exposure 0, in codes of a linear ADC.
     not_identifiable : mapping of str to str
         Parameters that the frames do not determine, and why.
     maps : mapping of str to (n_y, n_x) float64
