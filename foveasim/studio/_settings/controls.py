@@ -41,6 +41,8 @@ BOUNDS = ("minimum", "exclusiveMinimum", "maximum", "usual")
 ENUMERATED = ("integration_order",)
 #: Keys that select an alternative of a section.
 TAGS = ("kind", "generator")
+#: Sections that settings have on the page, also where a file may omit them.
+REQUIRED = ("layout",)
 #: Required parameters that are files without a bundled one, which the page asks for.
 FROM_FILES = ("path", "file")
 #: Optional parameters that new sections contain: framing and light of scenes.
@@ -73,7 +75,9 @@ def controls_of(settings: Mapping[str, Any], start: Mapping[str, Any] | None = N
     start = settings if start is None else start
     found: list[dict[str, Any]] = []
     for name, node in root["properties"].items():
-        found += _controls(root, name, name, node, settings.get(name), start, is_required=name in root["required"])
+        found += _controls(
+            root, name, name, node, settings.get(name), start, is_required=name in REQUIRED or name in root["required"]
+        )
     found = _with_unknown(found, settings)
     n_of_key = Counter(control["key"] for control in found if "do" not in control)
     _distinguish(found)
