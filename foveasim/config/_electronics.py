@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
+from dataclasses import fields
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from foveasim.sensor import PRESETS, DataSheet, Sensor, read_datasheet
 from foveasim.sensor.published.presets import with_changes
 from foveasim.twin.frames.result import FILE_FORMAT, Twin, read_twin
 
-__all__ = ["ELECTRONICS", "read_twin_or_sites", "sensor_maker", "with_electronics"]
+__all__ = ["ELECTRONICS", "read_twin_or_sites", "sensor_maker", "values_of_twin", "with_electronics"]
 
 #: Keys of a sensor with the origin of its values, which its other keys replace.
 ELECTRONICS = ("preset", "datasheet", "twin")
@@ -66,6 +67,22 @@ def read_twin_or_sites(path: Path, **options: Any) -> Layout:
         return read_layout(path, **options)
     check_no_options(**{name: value for name, value in options.items() if name != "centre"})
     return read_twin(path).layout()
+
+
+def values_of_twin(sensor: Any) -> dict[str, Any]:
+    """Return the numbers and names that the twin of a sensor's settings gives; none without a twin that can be read."""
+    path = sensor.get("twin") if isinstance(sensor, Mapping) else None
+    try:
+        return {} if not isinstance(path, str) else _stored_values(path, Path(path).stat().st_mtime_ns)
+    except (FoveasimError, OSError, ValueError):
+        return {}
+
+
+@lru_cache(maxsize=4)
+def _stored_values(path: str, _time_ns: int) -> dict[str, Any]:
+    found = read_twin(path).sensor(maps=False)
+    values = {each.name: getattr(found, each.name) for each in fields(found)}
+    return {name: value for name, value in values.items() if isinstance(value, int | float | str)}
 
 
 def with_electronics(source: Source | str | Path | None, sensor: Any) -> Any:
