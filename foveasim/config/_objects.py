@@ -416,9 +416,9 @@ def read_layout(path: str | Path, **options: Any) -> Layout:
     Parameters
     ----------
     path : path or str
-        A GDSII, OASIS, GeoJSON, GeoParquet or npz file, recognised by its content; a YAML file of a generator and its
-        parameters; or a name, such as ``"giotto_2"``. A file of that name in the working directory comes first, as on
-        the command line.
+        A GDSII, OASIS, GeoJSON, GeoParquet or npz file, recognised by its content; the twin of a camera, whose pixels are
+        the photosites; a YAML file of a generator and its parameters; or a name, such as ``"giotto_2"``. A file of that name
+        in the working directory comes first, as on the command line.
     **options
         Options of the format, as for :func:`foveasim.layout.read_layout`: for GDSII and OASIS ``layer=`` of the photosites,
         ``cell=``, and ``channels=`` or ``layers=`` for the colour filters.

@@ -42,14 +42,18 @@ def frames_of(camera_pixels, signal_e, exposure_s, n, seed, colour=1.0):
     return np.clip(np.rint(GAIN * (charge + offset_e + noise) + BLACK_DN), 0, 4095).astype(np.uint16)
 
 
-def fitted(camera_pixels, **options):
-    colour = options.pop("colour", 1.0)
+def fitted(camera_pixels, *, colour=1.0, efficiency=None, **options):
+    """Fit a twin; with an efficiency, a photometer counted the photons."""
     stacks = [
         fs.twin.Stack(frames_of(camera_pixels, 0.0, time_s, 32, seed), time_s, light=0)
         for seed, time_s in enumerate((1e-3, 0.5, 1.0))
     ]
     stacks += [
-        fs.twin.Stack(frames_of(camera_pixels, 950.0 * k, 0.01 * k, 16, 9 + k, colour), 0.01 * k, light=1)
+        fs.twin.Stack(
+            frames_of(camera_pixels, 950.0 * k, 0.01 * k, 16, 9 + k, colour),
+            0.01 * k,
+            **({"light": 1} if efficiency is None else {"photons": 950.0 * k / efficiency}),
+        )
         for k in range(1, 11)
     ]
     return fs.twin.fit(stacks, bits=12, pixel_um=PITCH_UM, **options)
@@ -266,6 +270,8 @@ def test_given_values_replace_maps(twin):
     assert {"response_map", "offset_map"} <= set(added)
     assert added["row_noise"].noise_e == 50.0
     assert twin.sensor(bits=10).linearise(np.full(N_X * N_Y, 10.0)).gain_dn_per_e == pytest.approx(0.1, rel=0.02)
+    for name in ("response_map", "offset_map"):
+        assert name not in {effect.name for effect in twin.sensor(disabled=[name]).chain}
     assert twin.sensor(bits=10).provenance["replaced"] == ["bits"]
 
 
@@ -348,6 +354,32 @@ def test_frames_of_videos_share_the_maps(twin):
         assert np.corrcoef(codes[:30].mean(axis=0), codes[30:].mean(axis=0))[0, 1] > 0.95
         assert codes.var(axis=0, ddof=1).mean() == pytest.approx(variance_dn2.mean(), rel=0.05)
         assert codes.mean() == pytest.approx(mean_dn.mean(), rel=2e-3)
+
+
+def test_rolling_shutters_expose_rows_of_twins(twin):
+    """The top row is exposed first: when the light is switched off, only rows that began late are darker."""
+    camera = camera_of(twin.sensor(effects=[fs.sensor.effects.RowNoise(0.0)], prnu_fraction=0.0, dsnu_e=0.0))
+    dark = fs.Scene.flat(
+        **{**{name: value for name, value in SCENE.items() if name != "kind"}, "radiance_w_m2_sr_nm": 0.0}
+    )
+    line_s = EXPOSURE_S / N_Y
+    frames = [flat(), dark, dark, dark]
+    first = next(iter(camera.video(frames, exposure_s=EXPOSURE_S, frame_s=EXPOSURE_S, line_s=line_s, seed=0)))
+    rows = first.code.reshape(N_Y, N_X).mean(axis=1)
+
+    np.testing.assert_allclose(np.polyfit(np.arange(N_Y), rows, 1)[0] * N_Y, rows.max() - BLACK_DN, rtol=0.1)
+
+
+def test_longer_exposures_of_twins_add_charge(twin):
+    """The difference of two exposure times is the light, with the response of each pixel, and the dark current."""
+    sensor = twin.sensor()
+    rate = np.full(sensor.layout.n_sites, 1e5)
+    estimates = sensor.pattern("response_map")
+
+    codes = [sensor.expose(rate, time_s, seed=2, frame=k)[2].astype(float) for k, time_s in enumerate((0.01, 0.02))]
+    slope = (codes[1] - codes[0]) / (0.01 * GAIN)
+    assert slope.mean() == pytest.approx((rate * estimates).mean(), rel=0.02)
+    assert np.corrcoef(slope, estimates)[0, 1] > 0.6
 
 
 def codes_in_process(sensor):
@@ -497,6 +529,13 @@ def test_colours_respond_as_to_the_lamp(coloured):
     assert sensor.filter_names == ("R", "G", "B")
     np.testing.assert_allclose(means / means[0], [1.0, 0.7, 0.4], rtol=0.02)
     assert any("neutral" in text and "give filters" in text for text in sensor.provenance["assumptions"])
+
+
+def test_photons_give_the_efficiency_of_each_colour(camera_pixels):
+    sensor = fitted(camera_pixels, mosaic="RGGB", colour=COLOUR, efficiency=0.6).sensor()
+    e_per_photon = sensor.responsivity_e_per_j(np.array([550.0])) * fs.units.photon_energy_j(550.0)
+
+    np.testing.assert_allclose(e_per_photon[:, 0], [0.6, 0.42, 0.24], rtol=0.02)
 
 
 def test_given_filters_separate_colours(coloured):

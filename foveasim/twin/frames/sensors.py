@@ -42,7 +42,7 @@ def sensor_of(twin: Twin, layout: Layout | None, maps: bool | None, parameters: 
     """Return a sensor; see :meth:`foveasim.twin.Twin.sensor`."""
     sites = twin.layout() if layout is None else layout
     Sensor(sites)  # checks the layout
-    pixels = _pixels_of(twin, sites) if maps is not False else None
+    pixels = _pixels_of(twin, sites, is_own=layout is None) if maps is not False else None
     if maps and pixels is None:
         raise ParameterError("maps", "must be False for other photosites than the pixels of the camera", maps)
     scale: Floats | float = 1.0 if pixels is not None else np.asarray(sites.area_um2) / twin.pixel_um**2
@@ -84,9 +84,11 @@ def sensor_of(twin: Twin, layout: Layout | None, maps: bool | None, parameters: 
     )
 
 
-def _pixels_of(twin: Twin, sites: Layout) -> Ints | None:
+def _pixels_of(twin: Twin, sites: Layout, *, is_own: bool) -> Ints | None:
     """Return the pixel of each site, (n_site,) in the order of frames; None unless the sites are the pixels."""
     n_y, n_x = twin.shape
+    if is_own:  # the last row of frames first
+        return np.arange(n_y * n_x).reshape(n_y, n_x)[::-1].ravel()
     if sites.n_sites != n_y * n_x or np.ptp(sites.area_um2 / twin.pixel_um**2 - 1.0) > SAME_PIXEL:
         return None
     xy = np.asarray(sites.centroid_um) / twin.pixel_um
