@@ -96,7 +96,7 @@ def open_archive(
 
 
 def archive_format(path: Path) -> str | None:
-    """Return ``format`` in the metadata of a file of :func:`write_archive`; None for other files."""
+    """Return the format that the metadata of an archive name; None for other files."""
     try:
         with zip_members(path) as (archive, items):
             item = items[ABOUT]

@@ -1,4 +1,4 @@
-"""Origins of a sensor's values in settings: a preset, a data sheet, or the twin of a camera."""
+"""Origins of a sensor's values: presets, data sheets, and twins of cameras."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _twin_of(source: Source, path: str) -> Twin:
 
 
 def read_twin_or_sites(path: Path, **options: Any) -> Layout:
-    """Return the pixels of a twin, or the photosites of any other file with the options of its format."""
+    """Return the pixels of a twin, or the photosites of another file."""
     if archive_format(path) != FILE_FORMAT:
         return read_layout(path, **options)
     check_no_options(**{name: value for name, value in options.items() if name != "centre"})
@@ -70,7 +70,7 @@ def read_twin_or_sites(path: Path, **options: Any) -> Layout:
 
 
 def values_of_twin(sensor: Any) -> dict[str, Any]:
-    """Return the numbers and names that the twin of a sensor's settings gives; none without a twin that can be read."""
+    """Return the numbers and names of the twin in a sensor's settings, if there is one."""
     path = sensor.get("twin") if isinstance(sensor, Mapping) else None
     try:
         return {} if not isinstance(path, str) else _stored_values(path, Path(path).stat().st_mtime_ns)

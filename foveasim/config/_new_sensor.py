@@ -1,4 +1,4 @@
-"""New files of a sensor from a data sheet or the twin of a camera: the sheet, and a shot that uses it."""
+"""New files of a sensor: a data sheet, and a shot that uses it, or the twin of a camera."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def write_sensor_files(
 
 def write_shot_of_twin(twin: str | Path, path: str | Path | None = None, *, force: bool = False) -> Path:
     """
-    Write a commented shot whose sensor is that of a camera's twin, with other photosites, and return its path.
+    Write a commented shot with the sensor of a camera's twin, and return its path.
 
     ``path``: by default ``sensor.yaml`` in the working directory. Raises FileError when the file exists or cannot be written,
     or is not a twin.

@@ -103,10 +103,10 @@ def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:
 
 def choose_electronics(settings: dict[str, Any]) -> None:
     """
-    Replace the electronics by those of the preset, data sheet or twin, without earlier values.
+    Replace the electronics by those of their origin, without earlier values.
 
-    Files are read with the others of the settings, which are checked before. A quantum efficiency remains with a preset that
-    has none.
+    Origins are a preset, a data sheet or a twin. Files are read with the others of the settings, which are checked before. A
+    quantum efficiency remains with a preset that has none.
     """
     sensor = settings.get("sensor")
     if isinstance(sensor, dict) and any(sensor.get(name) is not None for name in ELECTRONICS):
@@ -147,7 +147,7 @@ def with_file(settings: Mapping[str, Any], start: Mapping[str, Any], key: str, l
 
 
 def with_twin(settings: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """Return settings with the sensor of a twin, without other filters, and the pixels of its camera."""
+    """Return settings with the sensor of a twin, and the pixels of its camera."""
     found = with_layout(settings, {"file": path})
     found.get("sensor", {}).pop("filters", None)
     put_setting(None, found, "sensor.twin", path)

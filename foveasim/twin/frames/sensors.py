@@ -85,7 +85,7 @@ def sensor_of(twin: Twin, layout: Layout | None, maps: bool | None, parameters: 
 
 
 def _pixels_of(twin: Twin, sites: Layout, *, is_own: bool) -> Ints | None:
-    """Return the pixel of each site, (n_site,) in the order of frames; None unless the sites are the pixels."""
+    """Return the pixel of each site, (n_site,); None unless the sites are the pixels."""
     n_y, n_x = twin.shape
     if is_own:  # the last row of frames first
         return np.arange(n_y * n_x).reshape(n_y, n_x)[::-1].ravel()
