@@ -35,7 +35,7 @@ STATISTICS: Mapping[str, tuple[str, ...]] = {
     "rts_probability": ("rts_fraction", "rts_e"),
 }
 #: Parameters of random patterns.
-PATTERNS = frozenset(name for names in STATISTICS.values() for name in names)
+PATTERNS = frozenset((*(name for names in STATISTICS.values() for name in names), "dnl_dn"))
 
 
 def sensor_of(twin: Twin, layout: Layout | None, maps: bool | None, parameters: Mapping[str, Any]) -> Sensor:
@@ -55,6 +55,8 @@ def sensor_of(twin: Twin, layout: Layout | None, maps: bool | None, parameters: 
         "read_noise_e": twin.value("read_noise_e"),
         "nonlinearity_fraction": twin.value("nonlinearity_fraction"),
     }
+    if "dnl_dn" in twin.estimates and twin.estimates["dnl_dn"].low > 0.0:
+        found["dnl_dn"] = twin.value("dnl_dn")
     if "full_well_e" in twin.estimates:
         found["full_well_e"] = twin.value("full_well_e") * scale
     if twin.temperature_k is not None:
