@@ -21,8 +21,8 @@ from foveasim.studio._settings.gaze import rows_of_file
 from foveasim.studio._settings.templates import has_mosaic
 from foveasim.studio._settings.unknowns import balanced
 from foveasim.studio._settings.uses import PLACES, use_of
+from foveasim.twin.frame_sensors import PATTERNS
 from foveasim.twin.frames.result import ADC_PARAMETERS
-from foveasim.twin.frames.sensors import PATTERNS
 
 if TYPE_CHECKING:
     from foveasim.studio._session import Session

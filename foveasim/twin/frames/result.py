@@ -22,8 +22,8 @@ from foveasim.layout.generators.grid import grid
 from foveasim.layout.readout import readout_by
 from foveasim.sensor import Sensor
 from foveasim.sensor.adc import ADC
+from foveasim.twin.frame_sensors import sensor_of
 from foveasim.twin.frames.intervals import Estimate, Uncertain
-from foveasim.twin.frames.sensors import sensor_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
