@@ -766,7 +766,9 @@ def schema(
 
 @app.command()
 def new(
-    kind: Annotated[str, typer.Argument(help=f"Kind of file: {KINDS}; or sensor with --from-datasheet.")],
+    kind: Annotated[
+        str, typer.Argument(help=f"Kind of file: {KINDS}; or sensor with --from-datasheet or --from-twin.")
+    ],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="File to write, by default KIND.yaml in this directory.")
     ] = None,
@@ -777,6 +779,10 @@ def new(
             "--from-datasheet", help="With the kind sensor: a data sheet, and a shot whose sensor has its values."
         ),
     ] = False,
+    from_twin: Annotated[
+        Path | None,
+        typer.Option("--from-twin", help="With the kind sensor: twin.npz of a camera, and a shot with its sensor."),
+    ] = None,
     changes: Annotated[
         list[str] | None,
         typer.Option("--set", help="Quantity of the data sheet, for example dark_noise_e=5.56; repeatable."),
@@ -785,7 +791,13 @@ def new(
     """Write a commented settings file to start from."""
     from foveasim.config import starting_command, write_starting_file
 
-    if from_datasheet or kind == "sensor" or changes:
+    if from_twin is not None and kind == "sensor" and not from_datasheet and not changes:
+        from foveasim.config._new_sensor import write_shot_of_twin
+
+        path = write_shot_of_twin(from_twin, out, force=force)
+        _report(f"wrote {path}; next: {starting_command('shot', path)}")
+        return
+    if from_datasheet or kind == "sensor" or changes or from_twin is not None:
         _new_sensor(kind, out, changes or (), force=force, from_datasheet=from_datasheet)
         return
     path = write_starting_file(kind, out, force=force)
@@ -799,7 +811,8 @@ def _new_sensor(kind: str, out: Path | None, changes: Sequence[str], *, force: b
 
     if kind != "sensor" or not from_datasheet:
         raise FoveasimError(
-            "--from-datasheet and the kind sensor belong together: foveasim new sensor --from-datasheet"
+            "the kind sensor needs either --from-datasheet or --from-twin, of which only the former accepts --set: "
+            "foveasim new sensor --from-datasheet"
         )
     if not changes and not sys.stdin.isatty():
         raise FoveasimError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +28,8 @@ SUFFIX = ".npy"
 IGNORED_ARRAY = "allow_pickle"
 #: Files that would decompress to more than this are rejected.
 MAX_DECOMPRESSED_BYTES = 8 * 2**30
+#: Largest metadata that are read to find out what a file is.
+MAX_ABOUT_BYTES = 2**28
 #: Bytes per read call.
 CHUNK_BYTES = 2**20
 
@@ -90,6 +93,19 @@ def open_archive(
         about, arrays = read_archive(source)
         check_version(source, about, what, file_format, version)
         yield about, arrays
+
+
+def archive_format(path: Path) -> str | None:
+    """Return the format that the metadata of an archive name; None for other files."""
+    try:
+        with zip_members(path) as (archive, items):
+            item = items[ABOUT]
+            with archive.open(item) as file:
+                about = json.loads(str(read_array(file, min(item.file_size, MAX_ABOUT_BYTES))))
+    except (FileError, KeyError, OSError, ValueError, zipfile.BadZipFile, zlib.error, RuntimeError, EOFError):
+        return None
+    found = about.get("format") if isinstance(about, dict) else None
+    return found if isinstance(found, str) else None
 
 
 @contextmanager

@@ -125,6 +125,19 @@ class LayerSection(Section):
     """Base of the sections of layouts, and of layouts that are layers of another one."""
 
 
+def _layout_or_twin(schema: dict[str, Any]) -> None:
+    """Let the JSON schema of a shot require a layout, or the twin of a camera."""
+    schema["required"].remove("layout")
+    twin = {"properties": {"sensor": {"type": "object", "required": ["twin"]}}, "required": ["sensor"]}
+    schema["anyOf"] = [{"required": ["layout"]}, twin]
+
+
+class _ShotBase(Section):
+    """Base of shots: the layout may be that of the sensor's twin."""
+
+    model_config = ConfigDict(json_schema_extra=_layout_or_twin)
+
+
 _Outline = Annotated[list[list[float]] | str, Field(description="vertices [x, y] in µm, or WKT")]
 #: Parameters with other types in files than in Python.
 _FILE_TYPES: dict[str, Any] = {
@@ -324,7 +337,8 @@ def _models(_versions: tuple[int, ...]) -> Models:
         Field(None, description="conditions on results, which foveasim run --require checks"),
     )
     summary = "A shot: scene or power map, optics, distortion, layout, sensor, exposure."
-    return Models(create_model("ShotSection", __base__=Section, __doc__=summary, **fields), layout, rules)
+    shot = create_model("ShotSection", __base__=_ShotBase, __doc__=summary, **fields)
+    return Models(shot, layout, rules)
 
 
 def _rules() -> type[Section]:
@@ -389,7 +403,26 @@ def _sensor() -> type[Section]:
         str | None,
         Field(None, description="file of a data sheet, whose values other keys replace: foveasim.sensor.DataSheet"),
     )
-    return create_model("sensor", __base__=sensor, __doc__=sensor.__doc__, preset=preset, datasheet=datasheet)
+    twin: Any = (
+        str | None,
+        Field(
+            None,
+            description=(
+                "file of the twin of a camera (foveasim twin), whose values other keys replace; without a layout, the "
+                "photosites are the pixels of the camera"
+            ),
+        ),
+    )
+    origins = {"preset": preset, "datasheet": datasheet, "twin": twin}
+    return create_model("sensor", __base__=sensor, __doc__=sensor.__doc__, **origins)
+
+
+def with_layout_of_twin(settings: Any) -> Any:
+    """Return settings of a shot with the layout of the sensor's twin, if they have no layout."""
+    sensor = settings.get("sensor") if isinstance(settings, Mapping) else None
+    if not isinstance(sensor, Mapping) or settings.get("layout") is not None or not isinstance(sensor.get("twin"), str):
+        return settings
+    return {**settings, "layout": sensor["twin"]}
 
 
 def _layout_kind(section: Any) -> str | None:

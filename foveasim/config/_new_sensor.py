@@ -1,7 +1,9 @@
-"""New files of a sensor from a data sheet: the sheet, and a shot that uses it."""
+"""New files of a sensor: a data sheet, and a shot that uses it, or the twin of a camera."""
 
 from __future__ import annotations
 
+import json
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
@@ -16,6 +18,7 @@ from foveasim.config._starting_files import starting_file
 from foveasim.errors import ConfigError, FileError, ParameterError
 from foveasim.sensor import DataSheet
 from foveasim.sensor.published.datasheet import QUANTITIES, _range_of
+from foveasim.twin.frames.result import read_twin
 
 #: Quantities that are asked for, the more common ones first; others are keys of the file.
 ASKED = (
@@ -81,21 +84,46 @@ def write_sensor_files(
     checked_datasheet(quantities)
     shot = Path("sensor.yaml" if path is None else path)
     sheet = shot.with_name(f"{shot.stem}_datasheet.yaml")
-    for file in (sheet, shot):
-        if file.exists() and not force:
-            raise FileError(file, "exists already; choose another file with --out, or replace it with --force")
     section = (
-        f"sensor:\n  datasheet: {sheet.name:<24} # values of a data sheet, which other keys replace\n"
+        f"  datasheet: {sheet.name:<24} # values of a data sheet, which other keys replace\n"
         "  filters: rgb                       # colour filters of the mosaic; omit it without filters\n"
     )
-    texts = {
-        sheet: HEADER + format_yaml(dict(quantities)),
-        shot: SENSOR.sub(lambda _: section, starting_file("shot"), count=1),
-    }
+    _write({sheet: HEADER + format_yaml(dict(quantities)), shot: _shot_with(section)}, force=force)
+    return sheet, shot
+
+
+def write_shot_of_twin(twin: str | Path, path: str | Path | None = None, *, force: bool = False) -> Path:
+    """
+    Write a commented shot with the sensor of a camera's twin, and return its path.
+
+    ``path``: by default ``sensor.yaml`` in the working directory. Raises FileError when the file exists or cannot be written,
+    or is not a twin.
+    """
+    shot = Path("sensor.yaml" if path is None else path)
+    name = json.dumps(os.path.relpath(twin, shot.parent), ensure_ascii=False)  # quoted for YAML, too
+    section = (
+        f"  twin: {name:<28} # values of a camera, which other keys replace\n"
+        "                                     # without the section layout: this camera, with the maps of its pixels\n"
+    )
+    if not any(each.startswith("qe") for each in read_twin(twin).estimates):
+        section += "  qe: {kind: silicon, depth_um: 3.0} # which the frames do not determine: they have no photons\n"
+    _write({shot: _shot_with(section)}, force=force)
+    return shot
+
+
+def _shot_with(section: str) -> str:
+    """Return the commented shot with other lines of its sensor."""
+    return SENSOR.sub(lambda _: f"sensor:\n{section}", starting_file("shot"), count=1)
+
+
+def _write(texts: Mapping[Path, str], *, force: bool) -> None:
+    """Write files, unless one exists."""
+    for file in texts:
+        if file.exists() and not force:
+            raise FileError(file, "exists already; choose another file with --out, or replace it with --force")
     for file, text in texts.items():
         with atomic_write(file) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    return sheet, shot
 
 
 def quantities_of(changes: Sequence[str]) -> dict[str, Any]:

@@ -23,7 +23,16 @@ from foveasim._io.yaml_files import parse_yaml, read_yaml
 from foveasim.camera import Camera
 from foveasim.camera._exposure import exposure_time
 from foveasim.capture import Capture
-from foveasim.config._models import FILE_OPTIONS, LayerSection, Models, PerArea, call_of, models
+from foveasim.config._electronics import ELECTRONICS, read_twin_or_sites, sensor_maker
+from foveasim.config._models import (
+    FILE_OPTIONS,
+    LayerSection,
+    Models,
+    PerArea,
+    call_of,
+    models,
+    with_layout_of_twin,
+)
 from foveasim.config._problems import adapter_of, plain_settings, validate
 from foveasim.config._requirements import Requirement
 from foveasim.config._sources import Source
@@ -31,14 +40,11 @@ from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid, PowerMap
 from foveasim.layout import LAYOUTS, PRESETS, DesignRules, Layout, bundled_layouts, inset, mosaic, snap
 from foveasim.layout.files import check_no_options, layout_path
-from foveasim.layout.files import read_layout as read_sites
 from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.scene._scene import FRAMINGS
-from foveasim.sensor import PRESETS as SENSOR_PRESETS
-from foveasim.sensor import DataSheet, Sensor, read_datasheet
+from foveasim.sensor import Sensor
 from foveasim.sensor.limits import ALTERNATIVES
-from foveasim.sensor.published.presets import with_changes
 from foveasim.video import GazePath
 from foveasim.video.frame_source import read_times
 
@@ -58,9 +64,8 @@ FILE_SETTINGS = (
     "path",
     "picture",
     "times_s",
+    "twin",
 )
-#: Keys of a sensor with the origin of its values, which its other keys replace.
-ELECTRONICS = ("preset", "datasheet")
 #: Settings of a section that replace each other.
 REPLACED: Mapping[str, tuple[tuple[str, ...], ...]] = {
     "scene": (FRAMINGS,),
@@ -243,7 +248,7 @@ def check_settings(source: Source | str | Path | None, settings: Mapping[str, An
     ...     print(error)
     exposure_s: must be a time in seconds, a fraction such as '1/50', 'auto', or a value such as 'EV 12', got "short"
     """
-    validate(source, models().shot, settings)
+    validate(source, models().shot, with_layout_of_twin(settings))
 
 
 def _make_uncached(_part: str, _settings: Any, make: Callable[[], Any]) -> Any:
@@ -302,8 +307,9 @@ def build_shot(
     (256,)
     """
     source = Source.of(source)
+    data = with_layout_of_twin(plain_settings(source, data))
     settings = validate(source, models().shot, data)
-    data = plain_settings(source, data)
+    make = sensor_maker(source, settings.sensor, cache)  # before the layout, which may be that of a twin
 
     def layout_file() -> LayoutFile:
         if not isinstance(settings.layout, str):
@@ -315,20 +321,11 @@ def build_shot(
 
     def sensor_of_layout() -> Sensor:
         section = settings.sensor
-        origins = [name for name in ELECTRONICS if getattr(section, name) is not None]
         arguments: dict[str, Any] = {
             name: value.per_um2 * layout.area_um2 if isinstance(value, PerArea) else value
             for name, value in _values(source, "sensor.", section).items()
-            if name not in ELECTRONICS and (not origins or name in section.model_fields_set)
+            if name not in ELECTRONICS and (make is Sensor or name in section.model_fields_set)
         }
-        make: Callable[..., Sensor] = Sensor
-        match origins:
-            case ["preset"]:
-                make, arguments["preset"] = Sensor.from_preset, section.preset
-            case ["datasheet"]:
-                make, arguments["sheet"] = Sensor.from_datasheet, sheet_of(source, section.datasheet)
-            case [_, _]:
-                raise source.error("sensor.datasheet", "must not be given together with 'preset'; remove one of them")
         sensor: Sensor = _call(source, "sensor", make, {"layout": layout, **arguments})
         return sensor
 
@@ -377,35 +374,6 @@ def build_shot(
     )
 
 
-def sheet_of(source: Source, path: str) -> DataSheet:
-    """Return the data sheet of a file in settings; errors have the lines of both files."""
-    file = source.directory / path
-    try:
-        return read_datasheet(file)
-    except ParameterError as error:
-        raise source.error("sensor.datasheet", str(Source.of(file).error(error.name, error.detail))) from None
-    except FoveasimError as error:
-        raise source.error("sensor.datasheet", str(error)) from None
-
-
-def with_electronics(source: Source | str | Path | None, sensor: Any) -> Any:
-    """
-    Return the settings of a sensor with the values of its preset or data sheet.
-
-    For sites without readout lines. Settings that :func:`build_shot` rejects are returned unchanged.
-    """
-    if not isinstance(sensor, Mapping):
-        return sensor
-    given = [name for name in ELECTRONICS if sensor.get(name) is not None]
-    if len(given) != 1 or not isinstance(origin := sensor[given[0]], str):
-        return sensor
-    if given == ["preset"] and origin not in SENSOR_PRESETS:
-        return sensor
-    electronics = SENSOR_PRESETS[origin] if given == ["preset"] else sheet_of(Source.of(source), origin)
-    others = {name: value for name, value in sensor.items() if name not in ELECTRONICS}
-    return with_changes(electronics.settings(), others)
-
-
 def _gaze_source(source: Source, rows: list[list[float]] | str | None) -> GazePath | Path | None:
     """Return the gaze path of checked settings, or its file."""
     if isinstance(rows, str):
@@ -448,9 +416,9 @@ def read_layout(path: str | Path, **options: Any) -> Layout:
     Parameters
     ----------
     path : path or str
-        A GDSII, OASIS, GeoJSON, GeoParquet or npz file, recognised by its content; a YAML file of a generator and its
-        parameters; or a name, such as ``"giotto_2"``. A file of that name in the working directory comes first, as on
-        the command line.
+        A GDSII, OASIS, GeoJSON, GeoParquet or npz file, recognised by its content; the twin of a camera, whose pixels are
+        the photosites; a YAML file of a generator and its parameters; or a name, such as ``"giotto_2"``. A file of that name
+        in the working directory comes first, as on the command line.
     **options
         Options of the format, as for :func:`foveasim.layout.read_layout`: for GDSII and OASIS ``layer=`` of the photosites,
         ``cell=``, and ``channels=`` or ``layers=`` for the colour filters.
@@ -513,7 +481,7 @@ def read_any_layout(
         found = read_layout_file(path)
         return replace(found, layout=found.layout.centre()) if centre else found
     options |= {"centre": centre}
-    return LayoutFile(layout=read_sites(path, **options), rules=None, source=str(path))
+    return LayoutFile(layout=read_twin_or_sites(path, **options), rules=None, source=str(path))
 
 
 def read_rules(path: str | Path) -> DesignRules:
@@ -587,7 +555,7 @@ def _read_sites(source: Source, prefix: str, section: Any) -> Layout:
     options = {name: getattr(section, name) for name in FILE_OPTIONS}
     if isinstance(options["layers"], str):
         options["layers"] = source.directory / options["layers"]
-    layout: Layout = _call(source, prefix.rstrip("."), read_sites, {"path": file, **options})
+    layout: Layout = _call(source, prefix.rstrip("."), read_twin_or_sites, {"path": file, **options})
     return layout
 
 

@@ -12,8 +12,9 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from foveasim.config._models import FILE_OPTIONS, PerArea, call_of, models
-from foveasim.config._objects import ELECTRONICS, FILE_SETTINGS, resolve_files
+from foveasim.config._electronics import ELECTRONICS
+from foveasim.config._models import FILE_OPTIONS, PerArea, call_of, models, with_layout_of_twin
+from foveasim.config._objects import FILE_SETTINGS, resolve_files
 from foveasim.config._problems import plain_settings, validate
 from foveasim.config._sources import Source
 from foveasim.layout import LAYOUTS, Layout
@@ -72,7 +73,7 @@ def to_python(settings: Mapping[str, Any], *, source: Source | str | Path | None
     True
     """
     source = Source.of(source)
-    data = plain_settings(source, settings)
+    data = with_layout_of_twin(plain_settings(source, settings))
     if source.file is not None:
         data = resolve_files(source.directory.absolute(), data)
     shot = validate(source, models().shot, data)
@@ -108,18 +109,22 @@ def _shot_lines(writer: _Writer, shot: Any) -> list[str]:
         camera["distortion"] = _Name("distortion")
     if shot.integration_order is not None:
         camera["order"] = shot.integration_order
-    sensor, make = {"layout": _Name("layout"), **writer.arguments(shot.sensor)}, "fs.Sensor"
+    sensor, make = writer.arguments(shot.sensor), "fs.Sensor"
+    first: dict[str, Any] = {"layout": _Name("layout")}
     for name in ELECTRONICS:
-        if (origin := sensor.pop(name, None)) is not None:
-            sensor = {"layout": sensor.pop("layout"), "origin": origin, **sensor}
-            make = f"fs.Sensor.from_{name}"
+        if (origin := sensor.pop(name, None)) is None:
+            continue
+        if name == "twin":
+            make = f"{writer.call('fs.twin.read_twin', {'path': origin}, positional=('path',))}.sensor"
+        else:
+            make, first["origin"] = f"fs.Sensor.from_{name}", origin
     capture = {"scene": _Name("scene"), "exposure_s": shot.exposure_s, "seed": shot.seed}
     for name in ("gaze_um", "axis"):
         if getattr(shot, name) != type(shot).model_fields[name].default:
             camera[name] = getattr(shot, name)
     return [
         *lines,
-        f"sensor = {writer.call(make, sensor, positional=() if make == 'fs.Sensor' else ('layout', 'origin'))}",
+        f"sensor = {writer.call(make, first | sensor, positional=() if make == 'fs.Sensor' else tuple(first))}",
         f"camera = {writer.call('fs.Camera', camera)}",
         writer.assignment("scene", shot.scene),
         f"capture = {writer.call('camera.capture', capture, positional=('scene',))}",

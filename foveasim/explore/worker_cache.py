@@ -20,6 +20,7 @@ from foveasim._core.threads import thread_count
 from foveasim._core.validation import Floats
 from foveasim.capture import Capture
 from foveasim.config import Shot, Source, build_shot
+from foveasim.config._models import with_layout_of_twin
 from foveasim.errors import FoveasimError
 from foveasim.explore._metrics import reference_of
 from foveasim.explore._records import Record, check_unique, to_values
@@ -315,7 +316,7 @@ def _image_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
 
 
 def _without(settings: Mapping[str, Any], sections: Sequence[str]) -> dict[str, Any]:
-    return {name: section for name, section in settings.items() if name not in sections}
+    return {name: section for name, section in with_layout_of_twin(settings).items() if name not in sections}
 
 
 def _responsivity_digest(shot: Shot) -> str:

@@ -22,7 +22,9 @@ from foveasim.config import (
     read_settings,
     resolve_files,
 )
-from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS, with_electronics
+from foveasim.config._electronics import with_electronics
+from foveasim.config._models import with_layout_of_twin
+from foveasim.config._objects import BUNDLED_PICTURE, FILE_SETTINGS
 from foveasim.errors import FileError, ParameterError, SimulationError, printable
 from foveasim.scene import Scene
 from foveasim.studio._messages.models import ApplyPreset, FitScene, RestoreSettings, handles
@@ -45,8 +47,7 @@ def start_settings(shot: str | Path | None, changes: Sequence[str] = ()) -> tupl
     ``changes``: "key=value". Raises ConfigError when the file cannot be read, or is not YAML.
     """
     path = demo_settings()[0] if shot is None else Path(shot)
-    settings = read_settings(path, changes)
-    settings = with_values(settings, path)
+    settings = with_values(with_layout_of_twin(read_settings(path, changes)), path)
     if isinstance(settings.get("layout"), str):
         settings["layout"] = _inlined(settings["layout"], path.parent)
     return resolve_files(path.parent.absolute(), settings), path.stem
@@ -62,10 +63,10 @@ def with_values(settings: dict[str, Any], path: str | Path) -> dict[str, Any]:
 
 
 def with_preset(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return settings with the values of the sensor's preset; a data sheet is not read."""
+    """Return settings with the values of the sensor's preset; files are not read."""
     sensor = settings.get("sensor")
-    has_sheet = isinstance(sensor, Mapping) and sensor.get("datasheet") is not None
-    return settings if has_sheet or sensor is None else {**settings, "sensor": with_electronics(None, sensor)}
+    is_preset = isinstance(sensor, Mapping) and sensor.get("datasheet") is None
+    return {**settings, "sensor": with_electronics(None, sensor)} if is_preset else settings
 
 
 def preset_paths() -> dict[str, Path]:
@@ -236,7 +237,7 @@ class Files:
         Raises FileError when the file is not available, or not valid YAML.
         """
         self.available(path)
-        settings: dict[str, Any] = resolve_files(Path(path).parent, read_settings(path))
+        settings: dict[str, Any] = resolve_files(Path(path).parent, with_layout_of_twin(read_settings(path)))
         self.check(settings.get("sensor"), "sensor")  # before its data sheet is read
         return with_values(settings, path)
 

@@ -9,9 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from reference.twins import small_twin
 
 import foveasim as fs
-from foveasim.config import STARTING_FILES, read_any_layout, read_rules, read_shot, starting_file
+from foveasim.config import (
+    STARTING_FILES,
+    build_shot,
+    read_any_layout,
+    read_rules,
+    read_settings,
+    read_shot,
+    starting_file,
+)
 from foveasim.explore import read_dataset, read_study, read_sweep
 from foveasim.explore.worker_cache import ShotRunner
 
@@ -178,17 +187,40 @@ def test_new_sensor_is_run(foveasim, tmp_path):
     assert shot.camera.capture(shot.scene, exposure_s=0.001, seed=0).saturated_fraction < 0.05
 
 
+NEEDS_ORIGIN = (
+    "error: the kind sensor needs either --from-datasheet or --from-twin, of which only the former accepts --set: foveasim new "
+    "sensor --from-datasheet\n"
+)
+
+
+def test_new_sensor_of_twin_is_run(foveasim, tmp_path):
+    """In another directory than its twin, with the layout of the shot and with the pixels of the camera."""
+    (tmp_path / "camera").mkdir()
+    small_twin().save(tmp_path / "camera" / "twin.npz")
+    result = foveasim("new", "sensor", "--from-twin", "camera/twin.npz", "--out", "shot.yaml", cwd=tmp_path)
+
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout == "wrote shot.yaml; next: foveasim run shot.yaml --out out\n"
+    settings = read_settings(tmp_path / "shot.yaml")
+    assert settings["sensor"] == {"twin": "camera/twin.npz", "qe": {"kind": "silicon", "depth_um": 3.0}}
+    assert read_shot(tmp_path / "shot.yaml", SMALL).camera.sensor.bits == 11
+    del settings["layout"]
+    assert build_shot(tmp_path / "shot.yaml", settings).camera.layout.n_sites == 48
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
         (
             ("sensor",),
-            "error: --from-datasheet and the kind sensor belong together: foveasim new sensor --from-datasheet\n",
+            NEEDS_ORIGIN,
         ),
         (
             ("sensor", "--from-datasheet"),
             "error: the quantities of the data sheet must be given as --set NAME=VALUE, or be typed in a terminal\n",
         ),
+        (("shot", "--from-twin", "twin.npz"), NEEDS_ORIGIN),
+        (("sensor", "--from-twin", "twin.npz"), "error: twin.npz: no such file\n"),
         (
             ("sensor", "--from-datasheet", "--set", "bits=12"),
             "error: 'pixel_um' must be in the data sheet\n",

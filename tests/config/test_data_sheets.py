@@ -10,8 +10,8 @@ import yaml
 import foveasim as fs
 from foveasim._core.provenance import to_plain_data
 from foveasim.config import build_shot, demo_settings, put_setting, read_settings, read_shot, to_python
+from foveasim.config._electronics import with_electronics
 from foveasim.config._new_sensor import asked_quantities, quantities_of
-from foveasim.config._objects import with_electronics
 from foveasim.errors import ConfigError, FileError, ParameterError
 
 SHEET = {

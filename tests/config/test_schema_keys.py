@@ -28,11 +28,12 @@ def example(schema, definitions):
         return schema["const"]
     if "enum" in schema:
         return schema["enum"][0]
+    if "properties" in schema:
+        required = [*schema.get("required", ()), *schema.get("anyOf", [{}])[0].get("required", ())]
+        return {key: example(schema["properties"][key], definitions) for key in required}
     for key in ("oneOf", "anyOf"):
         if key in schema:
             return example(schema[key][0], definitions)
-    if "properties" in schema:
-        return {key: example(schema["properties"][key], definitions) for key in schema.get("required", ())}
     if "prefixItems" in schema:
         return [example(item, definitions) for item in schema["prefixItems"]]
     if schema.get("type") == "array":
@@ -48,7 +49,7 @@ def sections(schema, definitions, put=lambda section: section, visited=None):
             return
         visited.add(schema["$ref"])
     schema = resolve(schema, definitions)
-    for alternative in (*schema.get("oneOf", ()), *schema.get("anyOf", ())):
+    for alternative in () if "properties" in schema else (*schema.get("oneOf", ()), *schema.get("anyOf", ())):
         yield from sections(alternative, definitions, put, visited)
     if "items" in schema:
         yield from sections(schema["items"], definitions, lambda item: put([item]), visited)

@@ -6,12 +6,13 @@ import copy
 import hashlib
 import json
 import typing
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 import pytest
 from pydantic import BaseModel
+from reference.twins import small_twin
 
 from foveasim._io.images import write_picture
 from foveasim.config import Source
@@ -216,6 +217,7 @@ SECTIONS = {
         SHOT["sensor"] | {"companding": "table", "companding_table": [0.0, 0.4, 0.7, 0.9, 1.0]},
         {"preset": "imx174"},
         {"datasheet": "sheet.yaml"},
+        {"twin": "twin.npz"},
         {},
     ],
 }
@@ -242,7 +244,14 @@ def leaves(model, section, prefix=""):
     """Yield path, type and value of every setting that a shot can have, including those that it has not."""
     for name, field in model.model_fields.items():
         path, value = prefix + name, section.get(name, field.default if not field.is_required() else None)
-        in_sections = "layout.edits", "sensor.companding_table", "sensor.datasheet", "scene.gaze_range_um", *LEVELS
+        in_sections = (
+            "layout.edits",
+            "sensor.companding_table",
+            "sensor.datasheet",
+            "sensor.twin",
+            "scene.gaze_range_um",
+            *LEVELS,
+        )
         if name in ("kind", "generator") or path in in_sections:
             continue
         if isinstance(value, dict) and own_models(field.annotation) and path not in OTHERS:
@@ -318,6 +327,7 @@ def runner(tmp_path, monkeypatch):
     np.save(tmp_path / "map.npy", rng.random((24, 24)))
     sheet = "{pixel_um: '2.25', bits: 12, qe_percent: '91.25', dark_noise_e: '5.560', saturation_e: '9458'}"
     (tmp_path / "sheet.yaml").write_text(sheet)
+    small_twin().save(tmp_path / "twin.npz")
     monkeypatch.chdir(tmp_path)
     returned = {}
     part = WorkerCache.part
@@ -386,3 +396,12 @@ def test_cached_sections_equal_fresh_ones(runner):
     values = [(section, value) for section, alternatives in SECTIONS.items() for value in alternatives]
 
     assert compare_with_fresh(runner, SHOT, values) == set()
+
+
+def test_layouts_of_twins_are_not_confused(runner, tmp_path):
+    """Settings without a layout have that of their twin."""
+    other = replace(small_twin(), maps={name: values[:4] for name, values in small_twin().maps.items()})
+    other.save(tmp_path / "other.npz")
+    base = {name: value for name, value in SHOT.items() if name != "layout"} | {"sensor": {"twin": "twin.npz"}}
+
+    assert compare_with_fresh(runner, base, [("sensor.twin", "other.npz"), ("sensor.bits", 10)]) == set()

@@ -11,6 +11,7 @@ from threading import Thread
 import numpy as np
 import pytest
 import torch
+from reference.twins import small_twin
 from torch.func import functional_call
 from torch.fx.experimental.proxy_tensor import make_fx
 
@@ -110,6 +111,22 @@ def test_layer_agrees_with_camera_with_its_parts(name):
     # Codes without noise are those of the sensor for the expected charges.
     noiseless = layer.readout.code(torch.tensor(capture.expected_e))
     assert torch.equal(layer(pictures_of(light)), noiseless) or name == "converter"
+
+
+def test_layer_has_the_maps_of_a_twin():
+    """Charges are those of captures; means of codes with noise are those of predictions."""
+    original, light, exposure_s = fs.Camera(optics=OPTICS, sensor=small_twin().sensor()), scene(), 0.001
+    capture = original.capture(light, exposure_s=exposure_s, seed=0)
+    layer = learn.SensorLayer(original, light, exposure_s=exposure_s)
+    found = layer.expected_e(pictures_of(light)).numpy()
+    codes = np.mean([layer(pictures_of(light)).numpy() for _ in range(300)], axis=0)
+    mean_dn, variance_dn2 = original.predict(light, exposure_s=exposure_s)
+    z = (codes - mean_dn) / np.sqrt(variance_dn2 / 300)
+
+    np.testing.assert_allclose(found, capture.expected_e, rtol=0, atol=1e-12 * capture.expected_e.max())
+    assert np.ptp(original.sensor.pattern("offset_map")) > 0.0
+    assert 0.0 < mean_dn.max() < 2047.0
+    assert np.abs(z).max() < 4.5
 
 
 @pytest.mark.parametrize("name", ["moved", "modes", "patches"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
+from reference.twins import small_twin
 
 import foveasim as fs
 from foveasim.errors import FileError
@@ -176,3 +177,65 @@ def test_chosen_data_sheet_replaces_electronics(recorder):
     assert state["errors"] == {}
     assert "bits" not in state["settings"]["sensor"]
     assert recorder.session.result.capture.bits == 11
+
+
+# -- twins of cameras --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def twin_content(tmp_path_factory):
+    path = tmp_path_factory.mktemp("twin") / "twin.npz"
+    small_twin().save(path)
+    return path.read_bytes()
+
+
+def test_dropped_twin_becomes_the_sensor(recorder, twin_content):
+    """Its pixels replace the layout, its values the electronics; later edits of both keep it."""
+    path = recorder.session.add_file("twin.npz", twin_content)
+    recorder.do(do="set", key="sensor.bits", value=14, final=True)
+    state = recorder.do(do="file", path=str(path))
+
+    assert use_of(path) == "twin"
+    assert state["errors"] == {}
+    assert state["settings"]["sensor"]["twin"] == str(path)
+    assert recorder.session.result.capture.bits == 11
+    assert recorder.session.result.shot.camera.layout.n_sites == 48
+    sensor = recorder.session.result.shot.camera.sensor
+    assert "response_map" in {effect.name for effect in sensor.chain}
+    controls = {control["key"]: control for control in recorder.session.controls}
+    assert controls["sensor.bits"]["default"] == 11
+    assert controls["sensor.read_noise_e"]["default"] == pytest.approx(5.0, rel=0.1)
+    state = recorder.do(do="set", key="sensor.read_noise_e", value=3.0, final=True)
+    assert state["settings"]["sensor"]["twin"] == str(path)
+    state = recorder.do(do="set", key="layout", value="square_grid", final=True)
+    assert state["errors"] == {}
+    assert state["settings"]["sensor"]["twin"] == str(path)
+    assert "response_map" not in {effect.name for effect in recorder.session.result.shot.camera.sensor.chain}
+    recorder.do(do="undo")
+    assert recorder.session.result.shot.camera.layout.n_sites == 48
+
+
+def test_settings_with_twins_open(recorder, tmp_path, twin_content):
+    """Without a layout, they have the pixels of the twin; files elsewhere are rejected before they are read."""
+    for directory in (recorder.session.files._uploads, tmp_path):
+        (directory / "twin.npz").write_bytes(twin_content)
+    settings = recorder.session.files._uploads / "shot.yaml"
+    start = {name: value for name, value in recorder.session.history.settings.items() if name != "layout"}
+    settings.write_text(yaml.safe_dump({**start, "sensor": {"twin": "twin.npz", "bits": 10}}))
+    state = recorder.do(do="file", path=str(settings))
+
+    assert state["errors"] == {}
+    path = str(recorder.session.files._uploads / "twin.npz")
+    assert (state["settings"]["sensor"], state["settings"]["layout"]) == ({"twin": path, "bits": 10}, {"file": path})
+    assert recorder.session.result.shot.camera.layout.n_sites == 48
+    settings.write_text(yaml.safe_dump({**start, "sensor": {"twin": str(tmp_path / "twin.npz")}}))
+    with pytest.raises(FileError, match="is not available here"):
+        recorder.session.files.settings_of(str(settings))
+
+
+def test_corrupt_twin_is_one_sentence(recorder, twin_content):
+    path = recorder.session.add_file("bad.npz", twin_content[:-300])
+    state = recorder.do(do="set", key="sensor.twin", value=str(path), final=True)
+
+    (message,) = state["errors"].values()
+    assert "bad.npz: is corrupt or not a valid foveasim twin" in message

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from films import write_film
 from PIL import Image
+from reference.twins import small_twin
 from typer.testing import CliRunner
 
 from foveasim.capture import Capture
@@ -495,6 +496,21 @@ def test_archive_runs_unchanged(recorder, tmp_path):
 
     assert np.array_equal(run_settings(tmp_path / "all" / "small.yaml", tmp_path / "out"), codes(recorder))
     assert np.array_equal(np.load(tmp_path / "all" / "codes.npy"), codes(recorder))
+
+
+def test_archive_contains_the_twin(recorder, tmp_path):
+    """Its settings have names of files next to them."""
+    small_twin().save(tmp_path / "twin.npz")
+    path = recorder.session.add_file("twin.npz", (tmp_path / "twin.npz").read_bytes())
+    recorder.do(do="file", path=str(path), id=1)
+    content, _ = _exported(recorder.session, "zip")
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        archive.extractall(tmp_path / "all")
+    found = yaml.safe_load((tmp_path / "all" / "small.yaml").read_text())
+
+    assert found["sensor"]["twin"] == "twin.npz"
+    assert (tmp_path / "all" / "twin.npz").read_bytes() == (tmp_path / "twin.npz").read_bytes()
+    assert np.array_equal(run_settings(tmp_path / "all" / "small.yaml", tmp_path / "out"), codes(recorder))
 
 
 def test_link_has_names_of_uploads(recorder, make_session):

@@ -238,6 +238,7 @@ def test_deep_values_are_rejected(recorder, settings):
         ("sensor.qe", {"kind": "file", "path": "/etc/passwd"}),
         ("sensor.filters", {"path": "/proc/self/environ"}),
         ("sensor.datasheet", "/etc/passwd"),
+        ("sensor.twin", "/etc/passwd"),
         ("optics.pupil", [{"kind": "image", "picture": "/etc/passwd"}]),
     ],
 )  # fmt: skip

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foveasim.config import get_setting, put_setting
-from foveasim.config._objects import ELECTRONICS, with_electronics
+from foveasim.config._electronics import ELECTRONICS, with_electronics
 from foveasim.errors import FileError
 from foveasim.layout import LAYOUTS
 from foveasim.sensor import PRESETS
@@ -21,12 +21,15 @@ from foveasim.studio._settings.gaze import rows_of_file
 from foveasim.studio._settings.templates import has_mosaic
 from foveasim.studio._settings.unknowns import balanced
 from foveasim.studio._settings.uses import PLACES, use_of
+from foveasim.twin.frame_sensors import PATTERNS
+from foveasim.twin.frames.result import ADC_PARAMETERS
 
 if TYPE_CHECKING:
     from foveasim.studio._session import Session
 
-#: Parameters of the electronics, which a preset or data sheet replaces.
+#: Parameters of the electronics, which a preset, data sheet or twin replaces.
 ELECTRONIC = PARAMETERS.union(*ALTERNATIVES, *(preset.parameters for preset in PRESETS.values()))
+OF_TWIN = ELECTRONIC.union(PATTERNS, ADC_PARAMETERS)
 #: Filters that a layout receives: a mosaic, or a colouring of the sites.
 MOSAIC = ["RG", "GB"]
 COLOURING = {"kind": "graph_colouring", "n_channels": 3}
@@ -100,15 +103,16 @@ def match_filters(settings: dict[str, Any], before: Mapping[str, Any]) -> None:
 
 def choose_electronics(settings: dict[str, Any]) -> None:
     """
-    Replace the electronics by those of the preset or data sheet, without earlier values.
+    Replace the electronics by those of their origin, without earlier values.
 
-    A data sheet is read with the other files of the settings, which are checked before. A quantum efficiency remains with a
-    preset that has none.
+    Origins are a preset, a data sheet or a twin. Files are read with the others of the settings, which are checked before. A
+    quantum efficiency remains with a preset that has none.
     """
     sensor = settings.get("sensor")
     if isinstance(sensor, dict) and any(sensor.get(name) is not None for name in ELECTRONICS):
-        others = {key: value for key, value in sensor.items() if key not in ELECTRONIC}
-        if others.get("datasheet") is None:
+        replaced = ELECTRONIC if sensor.get("twin") is None else OF_TWIN
+        others = {key: value for key, value in sensor.items() if key not in replaced}
+        if others.get("preset") is not None:
             earlier = {name: value for name, value in sensor.items() if name == "qe"}
             others = {**earlier, **with_electronics(None, others)}
         settings["sensor"] = others
@@ -142,6 +146,15 @@ def with_file(settings: Mapping[str, Any], start: Mapping[str, Any], key: str, l
     return found
 
 
+def with_twin(settings: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """Return settings with the sensor of a twin, and the pixels of its camera."""
+    found = with_layout(settings, {"file": path})
+    found.get("sensor", {}).pop("filters", None)
+    put_setting(None, found, "sensor.twin", path)
+    choose_electronics(found)
+    return found
+
+
 @handles(OpenFile)
 def _open_file(session: Session, message: OpenFile) -> dict[str, Any]:
     settings, path = session.history.settings, message.path
@@ -154,6 +167,8 @@ def _open_file(session: Session, message: OpenFile) -> dict[str, Any]:
             return with_layout(settings, session.files.layout_of(path))
         case "settings":
             return session.files.settings_of(path)
+        case "twin":
+            return with_twin(settings, path)
         case "gaze":
             return {**settings, "gaze_path": rows_of_file(path)}
     return with_file(settings, session.start.settings, *PLACES[use], path)

@@ -12,6 +12,7 @@ from typing import Any
 
 from foveasim._core.validation import words_and_unit
 from foveasim.config import bundled_layouts, get_setting, schema
+from foveasim.config._electronics import values_of_twin
 from foveasim.config._objects import FILE_SETTINGS
 from foveasim.studio._settings.labels import words_of
 from foveasim.studio._settings.templates import INITIAL, PER_AREA, has_mosaic, templates
@@ -41,6 +42,8 @@ BOUNDS = ("minimum", "exclusiveMinimum", "maximum", "usual")
 ENUMERATED = ("integration_order",)
 #: Keys that select an alternative of a section.
 TAGS = ("kind", "generator")
+#: Sections that settings have on the page, also where a file may omit them.
+REQUIRED = ("layout",)
 #: Required parameters that are files without a bundled one, which the page asks for.
 FROM_FILES = ("path", "file")
 #: Optional parameters that new sections contain: framing and light of scenes.
@@ -72,8 +75,11 @@ def controls_of(settings: Mapping[str, Any], start: Mapping[str, Any] | None = N
     root = _schema()
     start = settings if start is None else start
     found: list[dict[str, Any]] = []
-    for name, node in root["properties"].items():
-        found += _controls(root, name, name, node, settings.get(name), start, is_required=name in root["required"])
+    sections = dict(root["properties"])
+    sections["sensor"] = _with_values(_resolved(root, sections["sensor"]), values_of_twin(settings.get("sensor")))
+    for name, node in sections.items():
+        is_required = name in REQUIRED or name in root["required"]
+        found += _controls(root, name, name, node, settings.get(name), start, is_required=is_required)
     found = _with_unknown(found, settings)
     n_of_key = Counter(control["key"] for control in found if "do" not in control)
     _distinguish(found)
@@ -83,6 +89,13 @@ def controls_of(settings: Mapping[str, Any], start: Mapping[str, Any] | None = N
         is_form = control["kind"] == "choice" and n_of_key[control["key"]] > 1
         control["id"] = f"{control['key']}:form" if is_form else control["key"]
     return found
+
+
+def _with_values(node: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the schema of a section with other defaults."""
+    properties = {name: {**below, "default": values[name]} if name in values else below
+                  for name, below in node["properties"].items()}  # fmt: skip
+    return {**node, "properties": properties}
 
 
 def _distinguish(controls: list[dict[str, Any]]) -> None:

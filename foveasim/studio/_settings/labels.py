@@ -251,6 +251,11 @@ WORDS: dict[str, Words] = {
     "qe.transmission": Words("silicon transmission"),
     "optics.transmission": Words("lens transmission", synonyms="glass t-stop"),
     "trench_um": Words("trench"),
+    "twin": Words(
+        "twin of a camera",
+        "File of a camera's twin, whose values replace those of the sensor.",
+        synonyms="measured frames electronics",
+    ),
     "unit_um": Words("size of the smallest site"),
     "v_sat_v": Words("saturation voltage", synonyms="full scale swing"),
     "wavelength_nm": Words(synonyms="colour spectrum"),

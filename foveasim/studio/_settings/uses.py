@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from foveasim._io.formats import as_file_error, read_head
+from foveasim._io.formats import read_head
 from foveasim._io.images import PICTURE_EXTENSIONS
-from foveasim._io.npz import read_archive
+from foveasim._io.npz import archive_format
 from foveasim._io.yaml_files import read_yaml
 from foveasim.config import YAML_EXTENSIONS, schema
 from foveasim.errors import FileError
@@ -15,11 +15,12 @@ from foveasim.layout.files import FORMATS
 from foveasim.maps import MAP_FORMATS
 from foveasim.optics import PSF_FORMATS
 from foveasim.scene.cubes import CUBE_FORMATS
+from foveasim.twin.frames.result import FILE_FORMAT as TWIN_FORMAT
 from foveasim.video.gaze import COLUMNS as GAZE_COLUMNS
 
 __all__ = ["PLACES", "Use", "use_of"]
 
-Use = Literal["scene", "layout", "settings", "gaze", "calibration", "psfs", "map", "cube"]
+Use = Literal["scene", "layout", "settings", "gaze", "calibration", "psfs", "map", "cube", "twin"]
 #: Setting of each use that is a section with a file, and the label of the section among its choices.
 PLACES: dict[Use, tuple[str, str]] = {
     "calibration": ("distortion", "calibration"),
@@ -53,9 +54,8 @@ def use_of(path: Path) -> Use:
         return "calibration"
     found = [use for use, (table, _) in TABLES.items() if _is_of(table, path, head)]
     if head.startswith(ZIP) and found:
-        with as_file_error(path, "archive of arrays"):
-            about = read_archive(path)[0]
-            name = about.get("format") if isinstance(about, dict) else None
+        if (name := archive_format(path)) == TWIN_FORMAT:
+            return "twin"
         return next((use for use in found if name == f"foveasim {TABLES[use][1]}"), "map")  # of other programs, too
     if len(found) == 1:
         return found[0]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from foveasim.config import get_setting, put_setting
+from foveasim.config._electronics import ELECTRONICS
 from foveasim.errors import ParameterError, printable
 from foveasim.layout import Layout
 from foveasim.studio._engine import Simulated
@@ -46,7 +47,7 @@ def with_values(
         else:
             put_setting(None, settings, key, chosen_value(key, copy.deepcopy(value), controls, settings, start))
         settings = balanced(settings, key, before, layout_of)
-        if key in ("sensor.preset", "sensor.datasheet"):
+        if key.rpartition(".")[::2] in [("sensor", name) for name in ELECTRONICS]:
             choose_electronics(settings)
     return settings
 

@@ -615,7 +615,7 @@ class _Fit:
             )
         if self.n_classes > 1:
             self.assumptions.append(
-                "Colours have a response of their own, which is no part of sensor(): give filters and quantum efficiency."
+                "Colours have no spectral curves: sensor() has neutral filters with their responses to the lamp; give filters."
             )
         for name in fit.names:
             if name.startswith(("qe", "dark_doubling_k")):

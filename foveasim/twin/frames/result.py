@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.calls import OwnCheck
-from foveasim._core.validation import Floats, frozen_array
+from foveasim._core.validation import Floats, check_number, frozen_array
 from foveasim._io.npz import open_archive, write_archive
 from foveasim.layout import Layout
 from foveasim.layout.channels import mosaic as with_mosaic
 from foveasim.layout.generators.grid import grid
 from foveasim.layout.readout import readout_by
 from foveasim.sensor import Sensor
-from foveasim.sensor.effects.measured import ColumnNoise, OffsetMap, ResponseMap, RowNoise, TelegraphMap
-from foveasim.sensor.published.datasheet import SWING_V
+from foveasim.sensor.adc import ADC
+from foveasim.twin.frame_sensors import sensor_of
 from foveasim.twin.frames.intervals import Estimate, Uncertain
 
 if TYPE_CHECKING:
@@ -33,8 +33,11 @@ if TYPE_CHECKING:
 __all__ = ["Twin", "read_twin"]
 
 FILE_FORMAT, FILE_VERSION = "foveasim twin", 1
-#: Probability of RTS noise above which a pixel has it.
-MIN_PROBABILITY = 0.5
+#: Maps of a twin; those of offsets and responses are always known.
+MAPS = ("offset_e", "response_fraction", "noise_e", "is_defect", "dark_e_per_s", "rts_probability")
+#: Parameters of the ADC that a fit may be given, and mosaics.
+ADC_PARAMETERS = ("bits", "companding", "log_strength", "companding_table", "inl_dn")
+MOSAICS = (None, "RGGB", "BGGR", "GRBG", "GBRG")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -162,83 +165,36 @@ class Twin:
         found = readout_by(grid(n_x=n_x, n_y=n_y, pitch_um=self.pixel_um), "column")
         return with_mosaic(found, self.known["mosaic"]) if self.known.get("mosaic") else found
 
-    def sensor(self, layout: OwnCheck[Layout | None] = None, **parameters: Any) -> Sensor:
+    def sensor(self, layout: OwnCheck[Layout | None] = None, *, maps: bool | None = None, **parameters: Any) -> Sensor:
         """
-        Return the sensor of this camera, or a sensor of its kind with another layout.
+        Return the sensor of this camera, or a sensor of its kind with other photosites.
 
         Parameters
         ----------
         layout : Layout, optional
-            Other photosites. By default those of the camera, with the maps of its pixels; noise of the maps is reduced by
-            taking each value in proportion to its reliability. Other layouts have patterns of the same statistics: full well,
-            dark current and steps of the ADC in electrons are proportional to the area of a site; read noise is that of the
-            pixel.
+            Photosites, by default those of the camera, which have the maps of its pixels; noise of the maps is reduced by
+            taking each value in proportion to its reliability. Photosites that are all pixels of the camera, in any order and
+            anywhere, have them, too. Others have random patterns of the same statistics: full well, dark current and steps of
+            the ADC in electrons are proportional to the area of a site; read noise is that of the pixel.
+        maps : bool, optional
+            Whether sites have the maps of the pixels. False is another device of the kind, which ``device_seed`` draws.
         **parameters
-            Parameters of :class:`foveasim.Sensor`, such as ``filters`` and ``qe``, or values instead of estimated ones.
+            Parameters of :class:`foveasim.Sensor`, such as ``filters`` and ``qe``, or values instead of estimated ones and
+            their maps: ``prnu_fraction`` replaces the map of the response. ``effects`` act in addition to those of the twin, or
+            instead of one with the same name.
 
         Returns
         -------
         Sensor
+            Its ``provenance`` says what was assumed. With a mosaic and without ``filters``, the filters are neutral, with the
+            responses of the colours to the lamp.
+
+        Raises
+        ------
+        ParameterError
+            If a parameter is invalid, or maps are required for other photosites.
         """
-        own = layout is None
-        sites = self.layout() if layout is None else layout
-        scale = 1.0 if own else np.asarray(sites.area_um2) / self.pixel_um**2
-        n_codes = 2 ** int(self.known["bits"])
-        found: dict[str, Any] = {name: value for name, value in self.known.items() if name != "mosaic"}
-        found |= {
-            "v_sat_v": SWING_V,
-            "gain_dn_per_e": self.value("gain_dn_per_e") / scale,
-            "pedestal_v": SWING_V * (self.value("black_level_dn") + 0.5) / n_codes,
-            "read_noise_e": self.value("read_noise_e"),
-            "nonlinearity_fraction": self.value("nonlinearity_fraction"),
-        }
-        if "dnl_dn" in self.estimates and self.estimates["dnl_dn"].low > 0.0:
-            found["dnl_dn"] = self.value("dnl_dn")
-        if "qe" in self.estimates:
-            found["qe"] = min(self.value("qe"), 1.0)
-        if "full_well_e" in self.estimates:
-            found["full_well_e"] = self.value("full_well_e") * scale
-        if self.temperature_k is not None:
-            found["temperature_k"] = found["dark_reference_k"] = self.temperature_k
-        if "dark_doubling_k" in self.estimates:
-            found["dark_doubling_k"] = self.value("dark_doubling_k")
-        found |= self._maps_of_sites(sites) if own else self._statistics(sites, scale)
-        return Sensor(sites, **(found | parameters))
-
-    def _statistics(self, sites: Layout, scale: Floats | float) -> dict[str, Any]:
-        """Return the parameters of sensors of the same kind."""
-        names = (
-            "prnu_fraction", "dsnu_e", "dsnu_fraction", "hot_fraction", "hot_e_per_s", "dead_fraction", "rts_fraction",
-            "rts_e",
-        )  # fmt: skip
-        found: dict[str, Any] = {name: self.value(name) for name in names if name in self.estimates}
-        if "dark_e_per_s" in self.estimates:
-            found["dark_e_per_s"] = max(self.value("dark_e_per_s"), 0.0) * scale
-        if "readout_line" in sites.columns:
-            n_codes = 2 ** int(self.known["bits"])
-            found["line_fpn_fraction"] = self.value("dsnu_column_e") * self.value("gain_dn_per_e") / n_codes
-        return found | {"effects": self._noise_of_lines(sites)}
-
-    def _noise_of_lines(self, sites: Layout) -> list[Any]:
-        """Return the temporal noise of rows and columns, for layouts that have them."""
-        kinds = {"row": RowNoise, "column": ColumnNoise}
-        found = {name: self.estimates.get(f"{name}_noise_e") for name in kinds if name in sites.columns}
-        return [kinds[name](each.value) for name, each in found.items() if each is not None and each.low > 0.0]
-
-    def _maps_of_sites(self, sites: Layout) -> dict[str, Any]:
-        """Return the parameters of this device for its sites: the last row of frames first."""
-
-        def of_sites(name: str) -> Floats:
-            return np.ascontiguousarray(self.maps[name][::-1]).ravel()
-
-        effects: list[Any] = [ResponseMap(of_sites("response_fraction")), OffsetMap(of_sites("offset_e"))]
-        found: dict[str, Any] = {}
-        if "dark_e_per_s" in self.maps:
-            found["dark_e_per_s"] = np.maximum(of_sites("dark_e_per_s"), 0.0)
-        if "rts_probability" in self.maps:
-            steps = np.where(of_sites("rts_probability") > MIN_PROBABILITY, self.value("rts_e"), 0.0)
-            effects.append(TelegraphMap(steps))
-        return found | {"effects": effects + self._noise_of_lines(sites)}
+        return sensor_of(self, layout, maps, parameters)
 
     def save(self, path: str | Path) -> None:
         """
@@ -249,7 +205,11 @@ class Twin:
         FileError
             If the file cannot be written.
         """
-        about = {
+        write_archive(path, self._about(), dict(self.maps))
+
+    def _about(self) -> dict[str, Any]:
+        """Return all but the maps, as plain data."""
+        return {
             "format": FILE_FORMAT,
             "version": FILE_VERSION,
             "estimates": {name: list(each) for name, each in self.estimates.items()},
@@ -261,7 +221,9 @@ class Twin:
             "n_fitted": self.n_fitted,
             "temperature_k": self.temperature_k,
         }
-        write_archive(path, about, dict(self.maps))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (self._about(), dict(self.maps))
 
 
 def read_twin(path: str | Path) -> Twin:
@@ -277,18 +239,44 @@ def read_twin(path: str | Path) -> Twin:
     FileError
         If the file is not a twin, or is corrupt.
     """
-    with open_archive(path, "foveasim twin", FILE_FORMAT, FILE_VERSION) as (about, arrays):
-        return Twin(
-            MappingProxyType({name: Estimate(*map(float, each)) for name, each in about["estimates"].items()}),
-            MappingProxyType({str(name): str(reason) for name, reason in about["not_identifiable"].items()}),
-            MappingProxyType({name: frozen_array(np.asarray(each, np.float64)) for name, each in arrays.items()}),
-            tuple(MappingProxyType(each) for each in about["levels"]),
-            tuple(map(str, about["assumptions"])),
-            float(about["pixel_um"]),
-            MappingProxyType(about["known"]),
-            int(about["n_fitted"]),
-            None if about["temperature_k"] is None else float(about["temperature_k"]),
-        )
+    with open_archive(path, FILE_FORMAT, FILE_FORMAT, FILE_VERSION) as (about, arrays):
+        _check_stored(about, arrays)
+        return _restored(about, arrays)
+
+
+def _check_stored(about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Check names, shapes and numbers of an untrusted file."""
+    shapes = {each.shape for each in arrays.values()}
+    if (
+        not set(MAPS[:2]) <= set(arrays) <= set(MAPS)
+        or len(shapes) != 1
+        or len(*shapes) != 2
+        or 0 in next(iter(shapes))
+    ):
+        raise ValueError(f"its maps must be {', '.join(MAPS)}, of equal size")
+    if not all(np.isfinite(each).all() for each in arrays.values()):
+        raise ValueError("its maps must be finite")
+    known = dict(about["known"])
+    if known.pop("mosaic", None) not in MOSAICS or not {"bits"} <= set(known) <= set(ADC_PARAMETERS):
+        raise ValueError(f"its known parameters must be mosaic, {', '.join(ADC_PARAMETERS)}")
+    ADC(**known)
+    check_number("pixel_um", about["pixel_um"], above=0.0, at_most=1e3)
+    if not all(math.isfinite(float(value)) for value, *_ in about["estimates"].values()):
+        raise ValueError("its estimates must be finite")
+
+
+def _restored(about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Twin:
+    return Twin(
+        MappingProxyType({name: Estimate(*map(float, each)) for name, each in about["estimates"].items()}),
+        MappingProxyType({str(name): str(reason) for name, reason in about["not_identifiable"].items()}),
+        MappingProxyType({name: frozen_array(np.asarray(each, np.float64)) for name, each in arrays.items()}),
+        tuple(MappingProxyType(each) for each in about["levels"]),
+        tuple(map(str, about["assumptions"])),
+        float(about["pixel_um"]),
+        MappingProxyType(about["known"]),
+        int(about["n_fitted"]),
+        None if about["temperature_k"] is None else float(about["temperature_k"]),
+    )
 
 
 def twin_of(fitted: Fitted, names: list[str], pixel_um: float, known: Mapping[str, Any]) -> Twin:
