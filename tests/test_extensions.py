@@ -31,14 +31,14 @@ from foveasim.layout import (
 from foveasim.maps import MAP_FORMATS, Found
 from foveasim.metrics import METRICS
 from foveasim.optics import PSF_FORMATS, PUPILS, PSFGrid, PupilEdges
-from foveasim.scene import CUBE_FORMATS, SCENES
+from foveasim.scene import CUBE_FORMATS, DISPLAYS, SCENES
 from foveasim.sensor import PIXEL_OPTICS, Footprints, PixelOptics
 from foveasim.sensor.effects import EFFECTS, AdditiveNoise, Effect, FixedFactor, FixedOffset
 from foveasim.sensor.spectral import CURVES
 from foveasim.testing import check_all, check_extension, extensions
 
 REGISTRIES = (
-    LAYOUTS, EDITS, RULES, FORMATS, DERIVED_LAYERS, MAP_FORMATS, CUBE_FORMATS, EFFECTS, PIXEL_OPTICS, CURVES, SCENES, PUPILS, LENSES,
+    LAYOUTS, EDITS, RULES, FORMATS, DERIVED_LAYERS, MAP_FORMATS, CUBE_FORMATS, EFFECTS, PIXEL_OPTICS, CURVES, SCENES, DISPLAYS, PUPILS, LENSES,
     METRICS, PSF_FORMATS, COLUMNS,
 )  # fmt: skip
 NUMBERS = count()

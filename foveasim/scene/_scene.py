@@ -51,6 +51,7 @@ from foveasim.scene.cubes import (
     select,
     spectral_radiance,
 )
+from foveasim.scene.displays import Display, display_of, raster_of
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
 
@@ -98,7 +99,7 @@ class Scene:
     """
     Spectral radiance of a plane at a given distance in front of the lens.
 
-    Usually created by :meth:`from_picture`, :meth:`from_cube`, :meth:`flat` or :meth:`point_sources`.
+    Usually created by :meth:`from_picture`, :meth:`from_cube`, :meth:`from_display`, :meth:`flat` or :meth:`point_sources`.
 
     Parameters
     ----------
@@ -646,6 +647,86 @@ class Scene:
         )
 
     @classmethod
+    def from_display(
+        cls,
+        picture: OwnCheck[str | Path | ArrayLike],
+        display: Display | str,
+        *,
+        distance_m: float,
+        subpixels: bool = False,
+        wavelength_nm: Sequence[float] | None = None,
+        band_width_nm: float | Sequence[float] | None = None,
+    ) -> Scene:
+        """
+        Create a scene from a picture that a display shows.
+
+        Parameters
+        ----------
+        picture : path, image of Pillow, or (n_y, n_x) or (n_y, n_x, n_channel) array
+            Digital values of the pixels, as for :meth:`from_picture`: one pixel of the picture is one of the display. Profiles and
+            encodings of files are ignored, as by a display without colour management. Grey pictures have the same value in all
+            primaries; alpha is in front of black.
+        display : Display or str
+            Display, or the name of a bundled one: ``"lcd"`` or ``"oled"`` (:mod:`foveasim.scene.displays`).
+        distance_m : float, m
+            Distance of the display from the lens.
+        subpixels : bool
+            Whether pixels consist of the cells of the display, which are then the pixels of the scene, instead of being uniform.
+        wavelength_nm : sequence, optional, nm
+            Wavelengths of the scene, at which the spectra are interpolated linearly; by default those of the display. White keeps
+            its luminance.
+        band_width_nm : number or sequence, optional, nm
+            Widths of the bands; by default bands extend halfway to the adjacent wavelengths.
+
+        Returns
+        -------
+        Scene
+            One basis image per primary. The pixel pitch is that of the display, or of its cells. White is the illuminant, and
+            displays with the colours of sRGB show the linear sRGB of a photograph (``is_rgb``).
+
+        Raises
+        ------
+        FileError
+            If the picture cannot be read.
+        ParameterError
+            If the picture has no digital values from 0 to 1 for the primaries of the display, or the display has no cells.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> ramp = np.linspace(0.0, 1.0, 5)[np.newaxis]
+        >>> scene = fs.Scene.from_display(ramp, "lcd", distance_m=0.5)
+        >>> scene.luminance_cd_m2.round(2).tolist()  # 0.25 + 249.75 sRGB(v)
+        [[0.25, 12.96, 53.71, 130.75, 250.0]]
+        >>> fs.Scene.from_display(ramp, "lcd", distance_m=0.5, subpixels=True).basis.shape
+        (3, 3, 15)
+        """
+        shown, is_file = display_of(display), isinstance(picture, str | os.PathLike)
+        try:
+            light = raster_of(
+                shown,
+                as_encoded(picture, "srgb"),
+                subpixels=subpixels,
+                wavelength_nm=wavelength_nm,
+                band_width_nm=band_width_nm,
+            )
+        except ParameterError as error:
+            is_of_file = is_file and error.name == "picture"
+            raise (FileError(str(picture), str(error)) if is_of_file else error) from None
+        return cls(
+            freeze(light.basis),
+            light.spectrum_w_m2_sr_nm,
+            light.wavelength_nm,
+            light.band_width_nm,
+            light.pitch_um,
+            distance_m,
+            source=f"{picture if is_file else 'a picture array'} on a display ({shown.source or 'no source'})",
+            illuminant=light.white,
+            is_rgb=shown.has_srgb_colours,
+        )
+
+    @classmethod
     def flat(
         cls,
         *,
@@ -842,6 +923,11 @@ def _example_cube(directory: Path) -> dict[str, Any]:
     return {"path": str(directory / "cube.hdr"), "quantity": "radiance", "unit": "W/m2/sr/nm", **_GEOMETRY}
 
 
+def _example_on_display(directory: Path) -> dict[str, Any]:
+    """Write a picture as that of :func:`_example_picture`."""
+    return {"picture": _example_picture(directory)["picture"], "display": "lcd", "distance_m": 1.0}
+
+
 SCENES.register("picture", Scene.from_picture, example=_example_picture, expected=("#..", "#..", "##."))
 _FLAT = {**_GEOMETRY, **_BAND, "shape": (4, 6), "radiance_w_m2_sr_nm": 0.02}
 SCENES.register("flat", Scene.flat, example=_FLAT, expected=("##", "##"))
@@ -852,3 +938,4 @@ SCENES.register(
     expected=("#....#", "......", "......", "#....."),
 )
 SCENES.register("cube", Scene.from_cube, example=_example_cube, expected=("#..", "##."))
+SCENES.register("display", Scene.from_display, example=_example_on_display, expected=("#..", "#..", "##."))
