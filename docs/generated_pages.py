@@ -58,8 +58,9 @@ LEARN = "Gradients with respect to photosites, optics and electronics, for PyTor
 MODULES = {
     "foveasim": "The main classes, from scenes to captures: `import foveasim as fs`. The other modules are its attributes.",
     "foveasim.layout": "Layouts of photosites as packed polygons: generators, edits, design rules, files.",
-    "foveasim.scene": "Scenes: radiance from photographs, hyperspectral cubes, flat fields and point sources.",
+    "foveasim.scene": "Scenes: radiance from photographs, hyperspectral cubes, displays, flat fields and point sources.",
     "foveasim.scene.charts": "Test charts with physical sizes.",
+    "foveasim.scene.displays": "Bundled displays.",
     "foveasim.optics": "Pupils, aberrations, PSF, OTF, and the power map of a scene.",
     "foveasim.distortion": "Lens distortion models and calibration files.",
     "foveasim.maps": "Files of power maps from other programs.",

@@ -51,7 +51,8 @@ from foveasim.scene.cubes import (
     select,
     spectral_radiance,
 )
-from foveasim.scene.displays import Display, display_of, raster_of
+from foveasim.scene.displays._display import Display, display_of
+from foveasim.scene.displays._raster import raster_of
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
 
@@ -663,7 +664,7 @@ class Scene:
         Parameters
         ----------
         picture : path, image of Pillow, or (n_y, n_x) or (n_y, n_x, n_channel) array
-            Digital values of the pixels, as for :meth:`from_picture`: one pixel of the picture is one of the display. Profiles and
+            Digital values, one pixel of the picture for each of the display; formats as for :meth:`from_picture`. Profiles and
             encodings of files are ignored, as by a display without colour management. Grey pictures have the same value in all
             primaries; alpha is in front of black.
         display : Display or str
@@ -671,10 +672,10 @@ class Scene:
         distance_m : float, m
             Distance of the display from the lens.
         subpixels : bool
-            Whether pixels consist of the cells of the display, which are then the pixels of the scene, instead of being uniform.
+            Whether pixels are not uniform, but consist of the cells of the display, which are then the pixels of the scene.
         wavelength_nm : sequence, optional, nm
-            Wavelengths of the scene, at which the spectra are interpolated linearly; by default those of the display. White keeps
-            its luminance.
+            Wavelengths of the scene, at which spectra are interpolated linearly; by default those of the display. White has the
+            same luminance.
         band_width_nm : number or sequence, optional, nm
             Widths of the bands; by default bands extend halfway to the adjacent wavelengths.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from foveasim._core.provenance import to_plain_data
@@ -17,7 +19,7 @@ N_LEVELS = 33
 
 @check_of(DISPLAYS)
 def check_display(extension: Extension) -> None:
-    """Check the luminance of black, grey and white, the primaries, and the mean over the cells."""
+    """Check the luminances of greys, the primaries, and the mean over the cells."""
     display = extension.make()
     require(isinstance(display, Display), f"must return a Display, got {type(display).__name__}")
     greys = np.linspace(0.0, 1.0, N_LEVELS)[np.newaxis]
@@ -27,7 +29,9 @@ def check_display(extension: Extension) -> None:
         np.allclose(luminance_cd_m2[[0, -1]], limits_cd_m2, rtol=0.0, atol=ROUNDING * limits_cd_m2[1]),
         f"shows black and white of {luminance_cd_m2[[0, -1]].round(4).tolist()} cd/m², expected {limits_cd_m2.tolist()}",
     )
-    require(np.all(np.diff(luminance_cd_m2) >= 0.0), "must have a luminance that does not decrease with the digital value")
+    require(
+        np.all(np.diff(luminance_cd_m2) >= 0.0), "must have a luminance that does not decrease with the digital value"
+    )
     if extension.expected is not None:
         found, expected = display.primaries_xy, np.asarray(extension.expected)
         require(
@@ -45,7 +49,7 @@ def check_display(extension: Extension) -> None:
             f"has cells with a mean luminance of {of_cells:.6g} cd/m², expected {uniform:.6g}",
         )
     section = {"kind": "display", "picture": "skimage:camera", "display": extension.settings, "distance_m": 1.0}
-    by_file = shot_with("scene", section).scene
+    by_file: Any = shot_with("scene", section).scene
     again = Scene.from_display(np.zeros((1, 1)), display, distance_m=1.0)
     require(
         to_plain_data(by_file.spectrum_w_m2_sr_nm) == to_plain_data(again.spectrum_w_m2_sr_nm)

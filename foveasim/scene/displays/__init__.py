@@ -1,12 +1,13 @@
-"""Displays: their light for digital values, and the arrangement of their subpixels."""
+"""Bundled displays: an LCD and an OLED display."""
 
 from __future__ import annotations
 
 from foveasim._core.calls import publish
 from foveasim.scene.displays._bundled import lcd, oled
-from foveasim.scene.displays._display import Display, Transfer, display_of
-from foveasim.scene.displays._raster import Raster, raster_of
+from foveasim.scene.registry import DISPLAYS
 
-__all__ = ["Display", "Raster", "Transfer", "display_of", "lcd", "oled", "raster_of"]
+__all__ = ["lcd", "oled"]
+
+__getattr__ = DISPLAYS.attributes_of(__name__)
 
 publish(__name__)

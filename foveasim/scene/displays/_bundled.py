@@ -1,4 +1,4 @@
-"""Bundled displays: an LCD with the primaries of sRGB, an OLED display with those of DCI-P3."""
+"""Bundled displays: an LCD with the primaries of sRGB, an OLED with those of DCI-P3."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from foveasim._core.calls import OwnCheck, Usual
 from foveasim._core.validation import Floats, Ints, band_widths_nm, read_only
 from foveasim._io.primaries import SRGB_XY, xyz_of_xy
 from foveasim.scene._colorimetry import tristimulus
-from foveasim.scene.displays._display import LUMINANCE, PITCH, Display, Transfer
+from foveasim.scene.displays._display import BLACK, PITCH, WHITE, Display, Transfer
 from foveasim.scene.registry import DISPLAYS
 
 #: Bands (peak in nm, full width at half maximum in nm, relative height) of each primary. The last two digits of peaks and
@@ -42,7 +42,10 @@ def _white_balanced(bands: _Bands) -> tuple[Floats, Floats]:
     waves_nm = np.arange(FIRST_NM, LAST_NM + 1.0, STEP_NM)
     spectra = np.array(
         [
-            sum(height * np.exp(-4.0 * np.log(2.0) * ((waves_nm - peak_nm) / fwhm_nm) ** 2) for peak_nm, fwhm_nm, height in own)
+            sum(
+                height * np.exp(-4.0 * np.log(2.0) * ((waves_nm - peak_nm) / fwhm_nm) ** 2)
+                for peak_nm, fwhm_nm, height in own
+            )
             for own in bands
         ]
     )
@@ -55,8 +58,8 @@ def _white_balanced(bands: _Bands) -> tuple[Floats, Floats]:
 def lcd(
     *,
     pitch_um: Annotated[float, PITCH, Usual(50.0, 500.0)] = 264.6,
-    white_cd_m2: Annotated[float, LUMINANCE, Usual(50.0, 1000.0)] = 250.0,
-    black_cd_m2: Annotated[float, LUMINANCE, Usual(0.0, 1.0)] = 0.25,
+    white_cd_m2: Annotated[float, WHITE, Usual(50.0, 1000.0)] = 250.0,
+    black_cd_m2: Annotated[float, BLACK, Usual(0.0, 1.0)] = 0.25,
     transfer: OwnCheck[Transfer] = "srgb",
     cells: Sequence[Sequence[int]] | Ints | None = STRIPES,
     block: tuple[int, int] = (1, 1),
@@ -109,8 +112,8 @@ def lcd(
 def oled(
     *,
     pitch_um: Annotated[float, PITCH, Usual(50.0, 500.0)] = 63.5,
-    white_cd_m2: Annotated[float, LUMINANCE, Usual(50.0, 1000.0)] = 500.0,
-    black_cd_m2: Annotated[float, LUMINANCE, Usual(0.0, 1.0)] = 0.0,
+    white_cd_m2: Annotated[float, WHITE, Usual(50.0, 1000.0)] = 500.0,
+    black_cd_m2: Annotated[float, BLACK, Usual(0.0, 1.0)] = 0.0,
     transfer: OwnCheck[Transfer] = "srgb",
     cells: Sequence[Sequence[int]] | Ints | None = PENTILE,
     block: tuple[int, int] = PENTILE_BLOCK,
@@ -136,8 +139,8 @@ def oled(
     -----
     The spectra are not a measurement. They are Gaussian bands with half widths of 20 to 35 nm and shoulders at longer
     wavelengths. Peaks and heights are the solution for the primaries of SMPTE EG 432-1 (DCI-P3); the chromaticities agree to
-    5e-4. White is D65, as for Display P3. Measurements of OLED displays found large contrast ratios, and transfer functions that
-    are powers (E. A. Cooper et al., Assessment of OLED displays for vision research, J. Vis. 13(12), 16, 2013).
+    5e-4. White is D65, as for Display P3. Measured OLED displays had large contrast ratios, and powers as transfer functions
+    (E. A. Cooper et al., Assessment of OLED displays for vision research, J. Vis. 13(12), 16, 2013).
 
     Examples
     --------

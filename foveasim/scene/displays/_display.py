@@ -37,7 +37,8 @@ from foveasim.units import decode_srgb
 Transfer = float | Literal["srgb"] | Sequence[float] | Sequence[Sequence[float]]
 #: The pixels of walls of LEDs are up to a few centimetres wide, and their luminances up to 1e4 cd/m².
 PITCH = Limits(above=0.0, at_most=1e6, hint="the pixel pitch is in µm, 25400 over the dots per inch")
-LUMINANCE = Limits(at_least=0.0, at_most=1e6, hint="luminances are in cd/m²")
+WHITE = Limits(above=0.0, at_most=1e6, hint="luminances are in cd/m²")
+BLACK = Limits(at_least=0.0, at_most=1e6, hint="luminances are in cd/m²")
 GAMMA = Limits(above=0.0, at_most=10.0)
 RADIANCE = Limits(at_least=0.0, at_most=1e24)
 #: Micrometres per inch.
@@ -100,8 +101,8 @@ class Display:
     Light is Lambertian, constant in time, and independent of other pixels; reflections of other light are not included.
 
     Displays of ISETCam (``displayCreate``) have the same data: ``wave`` and ``spd`` are ``wavelength_nm`` and the transposed
-    ``primaries`` in W/(m² sr nm), ``gamma`` is a table ``transfer``, ``dpi`` is 25400 / ``pitch_um``, and the ``dixel`` with its
-    pixels is ``cells`` and ``block``.
+    ``primaries`` in W/(m² sr nm), ``gamma`` is a table ``transfer``, ``dpi`` is 25400 / ``pitch_um``, and the ``dixel`` is
+    ``cells`` and ``block``.
 
     Examples
     --------
@@ -109,8 +110,11 @@ class Display:
 
     >>> import foveasim as fs
     >>> amber = fs.scene.Display(
-    ...     wavelength_nm=[570.0, 590.0, 610.0], primaries=[[0.2, 1.0, 0.2]],
-    ...     pitch_um=250.0, white_cd_m2=100.0, transfer=2.2,
+    ...     wavelength_nm=[570.0, 590.0, 610.0],
+    ...     primaries=[[0.2, 1.0, 0.2]],
+    ...     pitch_um=250.0,
+    ...     white_cd_m2=100.0,
+    ...     transfer=2.2,
     ... )
     >>> amber.dpi
     101.6
@@ -121,8 +125,8 @@ class Display:
     wavelength_nm: Sequence[float] | Floats
     primaries: Sequence[Sequence[float]] | Floats
     pitch_um: Annotated[float, PITCH, Usual(50.0, 500.0)]
-    white_cd_m2: Annotated[float, LUMINANCE, Usual(50.0, 1000.0)] | None = None
-    black_cd_m2: Annotated[float, LUMINANCE, Usual(0.0, 1.0)] = 0.0
+    white_cd_m2: Annotated[float, WHITE, Usual(50.0, 1000.0)] | None = None
+    black_cd_m2: Annotated[float, BLACK, Usual(0.0, 1.0)] = 0.0
     transfer: OwnCheck[Transfer] = "srgb"
     cells: Sequence[Sequence[int]] | Ints | None = None
     block: tuple[int, int] = (1, 1)
@@ -139,18 +143,23 @@ class Display:
         primaries = RADIANCE.check_array("primaries", self.primaries, ndim=2)
         if primaries.shape[0] == 0 or primaries.shape[1] != waves_nm.size:
             raise ParameterError(
-                "primaries", f"must have the shape (n_primary, n_wavelength) = (..., {waves_nm.size}), got {primaries.shape}"
+                "primaries",
+                f"must have the shape (n_primary, n_wavelength) = (..., {waves_nm.size}), got {primaries.shape}",
             )
         order = np.argsort(waves_nm)
         waves_nm, primaries, widths_nm = waves_nm[order], primaries[:, order], widths_nm[order]
         own_cd_m2 = luminance_of(primaries, waves_nm, widths_nm)
         if not own_cd_m2.any():
-            raise ParameterError("primaries", "must have light between 380 and 780 nm", hint="displays have a luminance")
+            raise ParameterError(
+                "primaries", "must have light between 380 and 780 nm", hint="displays have a luminance"
+            )
         white_cd_m2 = self.white_cd_m2
         if white_cd_m2 is None:
-            white_cd_m2 = LUMINANCE.check("primaries", float(own_cd_m2.sum()) + self.black_cd_m2)
+            white_cd_m2 = float(own_cd_m2.sum()) + self.black_cd_m2
         if not self.black_cd_m2 < white_cd_m2:
-            raise ParameterError("black_cd_m2", f"must be less than 'white_cd_m2', {white_cd_m2:g}", self.black_cd_m2, "cd/m²")
+            raise ParameterError(
+                "black_cd_m2", f"must be less than 'white_cd_m2', {white_cd_m2:g}", self.black_cd_m2, "cd/m²"
+            )
         cells, block = _checked_cells(self.cells, self.block, primaries.shape[0])
         for name, value in {
             "wavelength_nm": read_only(waves_nm),
@@ -164,7 +173,7 @@ class Display:
 
     @property
     def primaries_xy(self) -> Floats:
-        """CIE 1931 chromaticities x and y of the primaries, (n_primary, 2); NaN for invisible ones."""
+        """CIE 1931 chromaticities of the primaries, (n_primary, 2); NaN for invisible ones."""
         return self._chromaticities(np.asarray(self.primaries))
 
     @property
@@ -197,7 +206,7 @@ class Display:
 
     def relative_luminance(self, values: Floats) -> Floats:
         """
-        Return the luminance of each primary for digital values, relative to that of the value 1.
+        Return the luminance of each primary for digital values, relative to the value 1.
 
         Parameters
         ----------
@@ -238,8 +247,8 @@ class Display:
         path: str | Path,
         *,
         pitch_um: Annotated[float, PITCH, Usual(50.0, 500.0)],
-        white_cd_m2: Annotated[float, LUMINANCE, Usual(50.0, 1000.0)] | None = None,
-        black_cd_m2: Annotated[float, LUMINANCE, Usual(0.0, 1.0)] = 0.0,
+        white_cd_m2: Annotated[float, WHITE, Usual(50.0, 1000.0)] | None = None,
+        black_cd_m2: Annotated[float, BLACK, Usual(0.0, 1.0)] = 0.0,
         transfer: OwnCheck[Transfer] = "srgb",
         cells: Sequence[Sequence[int]] | Ints | None = None,
         block: tuple[int, int] = (1, 1),
@@ -336,7 +345,9 @@ def display_of(display: Display | str) -> Display:
         ) from None
     made = make()
     if not isinstance(made, Display):
-        raise ParameterError("display", f"must be the name of a function that returns a Display, got {type(made).__name__}")
+        raise ParameterError(
+            "display", f"must be the name of a function that returns a Display, got {type(made).__name__}"
+        )
     return made
 
 
@@ -402,7 +413,9 @@ def _checked_cells(cells: Any, block: Any, n_primary: int) -> tuple[Ints | None,
     allowed = {float(k) for k in range(DARK, n_primary)}
     odd = [value for value in np.unique(found).tolist() if value not in allowed]
     if odd:
-        raise ParameterError("cells", f"must be indices of primaries, 0 to {n_primary - 1}, or -1 for cells without light", odd[0])
+        raise ParameterError(
+            "cells", f"must be indices of primaries, 0 to {n_primary - 1}, or -1 for cells without light", odd[0]
+        )
     missing = [k for k in range(n_primary) if not np.any(found == k)]
     if missing:
         raise ParameterError("cells", f"must contain each of the {n_primary} primaries; {missing[0]} is missing")

@@ -61,7 +61,7 @@ def raster_of(
 
 
 def _spectra(display: Display, wavelength_nm: Any, band_width_nm: Any) -> tuple[Floats, Floats, Floats]:
-    """Return the spectra of the primaries with the luminance of white, their wavelengths and the widths of bands."""
+    """Return spectra of the primaries with the luminance of white, wavelengths, and widths."""
     waves_nm, spectra = np.asarray(display.wavelength_nm), np.asarray(display.primaries)
     if wavelength_nm is not None:
         at_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
@@ -70,13 +70,16 @@ def _spectra(display: Display, wavelength_nm: Any, band_width_nm: Any) -> tuple[
     per_unit = float(luminance_of(spectra.sum(axis=0), waves_nm, widths_nm))
     if per_unit == 0.0:
         raise ParameterError(
-            "wavelength_nm", "must have a band between 380 and 780 nm with light of the display", waves_nm.tolist(), "nm"
+            "wavelength_nm",
+            "must have a band between 380 and 780 nm with light of the display",
+            waves_nm.tolist(),
+            "nm",
         )
     return spectra * ((display.white_cd_m2 or 0.0) / per_unit), waves_nm, widths_nm
 
 
 def _levels(display: Display, picture: EncodedPicture) -> Images32:
-    """Return the relative luminances (n_primary, n_y, n_x) of a picture, bottom row first, without the light of black."""
+    """Return relative luminances (n_primary, n_y, n_x), bottom row first, without black."""
     n_primary = np.asarray(display.primaries).shape[0]
     digital = _digital_values(picture, n_primary)
     if digital.dtype.kind == "f":
@@ -90,7 +93,7 @@ def _levels(display: Display, picture: EncodedPicture) -> Images32:
 
 
 def _digital_values(picture: EncodedPicture, n_primary: int) -> NDArray[Any]:
-    """Return digital values (n_primary or 1, n_y, n_x), integers or floats from 0 to 1, in front of black."""
+    """Return digital values (n_primary or 1, n_y, n_x), integers or floats from 0 to 1."""
     pixels = np.asarray(picture.pixels)
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.bool_:
@@ -101,7 +104,8 @@ def _digital_values(picture: EncodedPicture, n_primary: int) -> NDArray[Any]:
     has_alpha = n_channels != n_primary and n_channels in (2, n_primary + 1)
     if pixels.ndim not in (2, 3) or 0 in pixels.shape or n_channels - has_alpha not in (1, n_primary):
         raise ParameterError(
-            "picture", f"must have 1 or {n_primary} channels, those of the display, and alpha or none, got the shape {pixels.shape}"
+            "picture",
+            f"must have 1 or {n_primary} channels, as the display, and alpha or none, got the shape {pixels.shape}",
         )
     if pixels.dtype.kind == "f":
         pixels = pixels.astype(np.float64)
@@ -122,7 +126,9 @@ def _digital_values(picture: EncodedPicture, n_primary: int) -> NDArray[Any]:
 
 def _with_cells(display: Display, values: Images32) -> tuple[Images32, Floats, int]:
     """
-    Return images (n_primary, n_y * n, n_x * n) of cells, factors (n_primary,) of their light, and the cells n along a pixel.
+    Return images of cells, factors of the spectra, and the cells along a side of a pixel.
+
+    The images are (n_primary, n_y n, n_x n) for n cells, the factors (n_primary,).
     """
     layout, (rows, columns) = np.asarray(display.cells)[::-1], display.block
     n_primary, n_y, n_x = values.shape
@@ -142,7 +148,11 @@ def _with_cells(display: Display, values: Images32) -> tuple[Images32, Floats, i
 
 
 def _block_means(values: Images32, rows: int, columns: int) -> Images32:
-    """Return the mean over the block of each pixel; incomplete blocks are continued by their outermost pixels."""
+    """
+    Return the mean over the block of each pixel.
+
+    Incomplete blocks are continued by their outermost pixels.
+    """
     n_y, n_x = values.shape
     # The block at the top left is complete; row 0 is the lowest row.
     padded = np.pad(values, ((-n_y % rows, 0), (0, -n_x % columns)), mode="edge").astype(np.float64)
@@ -151,8 +161,8 @@ def _block_means(values: Images32, rows: int, columns: int) -> Images32:
 
 
 def _fill(out: Images32, values: Images32, is_lit: Bools, n: int) -> None:
-    """Write the values of pixels to the lit cells of an image, in blocks that begin at the top left."""
-    n_y, n_x = out.shape
+    """Write the values of pixels to the lit cells; blocks begin at the top left."""
+    n_x = out.shape[1]
     across = -(-n_x // is_lit.shape[1])
     tiled = np.tile(is_lit, (1, across))[:, :n_x]
     for row in range(values.shape[0]):
