@@ -123,7 +123,7 @@ THUMBNAIL_PX, TALLEST = (480, 360), 0.9
 CHAPTERS = {
     "First pictures": (1, 31, 26),
     "Design": (4, 12, 13, 14, 15, 16, 17),
-    "Light": (32, 2, 3, 5, 6, 34, 7, 18),
+    "Light": (32, 2, 3, 5, 37, 6, 34, 7, 18),
     "Electronics": (9, 10, 8, 11, 20, 25, 33),
     "Measure": (19, 24),
     "Scale": (21, 22, 23),
