@@ -139,6 +139,8 @@ class Scene:
         reproduces.
     axis_um : (x, y), optional, µm
         With ``fit``, where the optical axis meets the sensor; :meth:`foveasim.Camera.fit_scene` sets it with the pitch.
+    display : Display, optional
+        Display that shows the picture, as the frames of a video with this scene as template: :meth:`from_display`.
 
     Raises
     ------
@@ -180,6 +182,7 @@ class Scene:
     illuminant: Floats | None = field(default=None, kw_only=True)
     is_rgb: bool = field(default=False, kw_only=True)
     axis_um: tuple[float, float] | None = field(default=None, kw_only=True)
+    display: Display | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         check_declared(self)
@@ -288,6 +291,7 @@ class Scene:
             gaze_range_um=(0.0, 0.0),
             field_of_view_deg=None,
             axis_um=None,
+            display=None,
         )
 
     def framed(self, pitch_um: float, axis_um: tuple[float, float] | None) -> Scene:
@@ -725,7 +729,47 @@ class Scene:
             source=f"{picture if is_file else 'a picture array'} on a display ({shown.source or 'no source'})",
             illuminant=light.white,
             is_rgb=shown.has_srgb_colours,
+            display=shown,
         )
+
+    def on_display(self, picture: OwnCheck[str | Path | ArrayLike]) -> Scene:
+        """
+        Return the scene of another picture on the display of this one.
+
+        Parameters
+        ----------
+        picture : path, image of Pillow, or array
+            As for :meth:`from_display`.
+
+        Returns
+        -------
+        Scene
+            With the distance, position and bands of this scene, and subpixels if it has them.
+
+        Raises
+        ------
+        ParameterError
+            If this scene has no display, or the picture does not have its digital values.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> white = fs.Scene.from_display(np.ones((2, 3)), "oled", distance_m=0.3)
+        >>> white.on_display(np.zeros((2, 3))).luminance_cd_m2.max()
+        np.float64(0.0)
+        """
+        if self.display is None or self.pitch_um is None:
+            raise ParameterError("picture", "requires a scene with a display, such as that of Scene.from_display")
+        scene = type(self).from_display(
+            picture,
+            self.display,
+            distance_m=self.distance_m,
+            subpixels=self.pitch_um < self.display.pitch_um,
+            wavelength_nm=self.wavelength_nm,  # type: ignore[arg-type]
+            band_width_nm=self.band_width_nm,  # type: ignore[arg-type]
+        )
+        return scene.with_centre(self.centre_um)
 
     @classmethod
     def flat(

@@ -391,7 +391,7 @@ CALLS = {
     ),
     "Scene.from_display": lambda o: fs.Scene.from_display(
         o.photos / "cats" / "0.png", "oled", distance_m=0.5, subpixels=True
-    ),
+    ).on_display(o.photos / "cats" / "1.png"),
     "Camera.video": lambda o: list(o.camera.video([o.scene] * 2, exposure_s=0.01, seed=0)),
     "Camera.noise_budget": lambda o: o.camera.noise_budget(o.scene, exposure_s=0.01).plot(),
     "Camera.compare_with": lambda o: o.twins,

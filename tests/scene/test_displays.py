@@ -285,6 +285,23 @@ def test_picture_of_lcd_returns_colours(picture):
     )
 
 
+def test_frames_of_videos_are_shown(picture):
+    template = scene_of(picture, "oled", subpixels=True, wavelength_nm=[450.0, 550.0, 620.0]).with_centre((10.0, 20.0))
+    frames = [picture, 255 - picture]
+
+    shown = list(fs.video.FrameSource(frames, frame_s=0.1, template=template))
+
+    for frame, scene in zip(frames, shown, strict=True):
+        expected = scene_of(frame, "oled", subpixels=True, wavelength_nm=[450.0, 550.0, 620.0])
+        assert np.array_equal(scene.basis, expected.basis)
+        assert np.array_equal(scene.spectrum_w_m2_sr_nm, expected.spectrum_w_m2_sr_nm)
+        assert (scene.pitch_um, scene.centre_um) == (expected.pitch_um, (10.0, 20.0))
+    with pytest.raises(ParameterError, match="'encoding' must not be given with a template that has a display"):
+        fs.video.FrameSource(frames, frame_s=0.1, template=template, encoding="linear")
+    with pytest.raises(ParameterError, match="'picture' requires a scene with a display"):
+        template.with_pitch(50.0).on_display(picture)
+
+
 # -- errors -----------------------------------------------------------------------------------------------------------
 
 

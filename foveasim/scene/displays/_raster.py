@@ -119,7 +119,7 @@ def _digital_values(picture: EncodedPicture, n_primary: int) -> NDArray[Any]:
         values = images / peak
         colours = values[:-1] if has_alpha else values
         if picture.encoding != "srgb":
-            colours = encode(decode(colours, picture.encoding), "srgb")
+            colours = encode(decode(np.clip(colours, 0.0, 1.0), picture.encoding), "srgb")
         return colours * values[-1] if has_alpha else colours
     return images
 
