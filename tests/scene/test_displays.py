@@ -274,15 +274,32 @@ def test_values_of_files_ignore_profiles(tmp_path, picture):
     assert "plain.png on a display (LCD, sRGB)" in plain.source
 
 
-def test_picture_of_lcd_returns_colours(picture):
-    """White is white, and the linear sRGB of the picture is corrected for, as that of photographs."""
+def test_picture_of_lcd_has_its_colours():
+    """The colour correction returns the linear sRGB of a uniform picture, relative to white."""
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=12, n_y=12, pitch_um=5.0), ("RG", "GB"))
+    sensor = fs.Sensor(layout, filters="rgb", shot_noise="off", bits=14, full_well_e=1e5)
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+
+    def capture(*digital):
+        scene = scene_of(np.full((40, 40, 3), digital, np.uint8), displays.lcd(pitch_um=1000.0, black_cd_m2=0.0))
+        return camera.capture(scene, exposure_s=0.02, seed=0)
+
+    found, white = (
+        np.nanmean(capture(*each).picture().data, axis=(1, 2)) for each in ((200, 120, 60), (255, 255, 255))
+    )
+    shown = capture(255, 255, 255).colour_correction.matrix @ (found / white)
+
+    assert shown == pytest.approx(fs.units.decode_srgb(np.array([200, 120, 60]) / 255), rel=0.02)
+
+
+def test_colours_of_displays_are_declared(picture):
     lcd, oled = (scene_of(picture, name) for name in ("lcd", "oled"))
 
     assert lcd.is_rgb
     assert not oled.is_rgb
-    assert lcd.illuminant == pytest.approx(
-        lcd.spectrum_w_m2_sr_nm.sum(axis=0) / lcd.spectrum_w_m2_sr_nm.sum(axis=0).max()
-    )
+    for scene in (lcd, oled):
+        white = scene.spectrum_w_m2_sr_nm.sum(axis=0)
+        assert scene.illuminant == pytest.approx(white / white.max())
 
 
 def test_frames_of_videos_are_shown(picture):
