@@ -58,8 +58,9 @@ LEARN = "Gradients with respect to photosites, optics and electronics, for PyTor
 MODULES = {
     "foveasim": "The main classes, from scenes to captures: `import foveasim as fs`. The other modules are its attributes.",
     "foveasim.layout": "Layouts of photosites as packed polygons: generators, edits, design rules, files.",
-    "foveasim.scene": "Scenes: radiance from photographs, hyperspectral cubes, flat fields and point sources.",
+    "foveasim.scene": "Scenes: radiance from photographs, hyperspectral cubes, displays, flat fields and point sources.",
     "foveasim.scene.charts": "Test charts with physical sizes.",
+    "foveasim.scene.displays": "Bundled displays.",
     "foveasim.optics": "Pupils, aberrations, PSF, OTF, and the power map of a scene.",
     "foveasim.distortion": "Lens distortion models and calibration files.",
     "foveasim.maps": "Files of power maps from other programs.",
@@ -122,7 +123,7 @@ THUMBNAIL_PX, TALLEST = (480, 360), 0.9
 CHAPTERS = {
     "First pictures": (1, 31, 26),
     "Design": (4, 12, 13, 14, 15, 16, 17),
-    "Light": (32, 2, 3, 5, 6, 34, 7, 18),
+    "Light": (32, 2, 3, 5, 37, 6, 34, 7, 18),
     "Electronics": (9, 10, 8, 11, 20, 25, 33),
     "Measure": (19, 24),
     "Scale": (21, 22, 23),

@@ -51,7 +51,7 @@ capture.save("capture.npz")
 again = fs.Capture.load("capture.npz")
 open("two.lines", "w").write("LINES\\n1 2\\n3 4\\n")
 cube = fs.Scene.from_cube("two.lines", distance_m=1.0)
-names = {"daisy", "stretch_x", "min_roundness", "boxes", "pad", "powers", "lines", "supply_ripple", "binary_gates", "baffle", "comb", "half_plane",
+names = {"daisy", "stretch_x", "min_roundness", "boxes", "pad", "powers", "lines", "supply_ripple", "binary_gates", "baffle", "comb", "half_plane", "amber",
          "half_moon", "magnifier", "darkest_code_dn", "spot", "charge_density"}
 own = [found for found in extensions() if found[1] in names]
 for kind, name in own:

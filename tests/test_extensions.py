@@ -31,14 +31,14 @@ from foveasim.layout import (
 from foveasim.maps import MAP_FORMATS, Found
 from foveasim.metrics import METRICS
 from foveasim.optics import PSF_FORMATS, PUPILS, PSFGrid, PupilEdges
-from foveasim.scene import CUBE_FORMATS, SCENES
+from foveasim.scene import CUBE_FORMATS, DISPLAYS, SCENES
 from foveasim.sensor import PIXEL_OPTICS, Footprints, PixelOptics
 from foveasim.sensor.effects import EFFECTS, AdditiveNoise, Effect, FixedFactor, FixedOffset
 from foveasim.sensor.spectral import CURVES
 from foveasim.testing import check_all, check_extension, extensions
 
 REGISTRIES = (
-    LAYOUTS, EDITS, RULES, FORMATS, DERIVED_LAYERS, MAP_FORMATS, CUBE_FORMATS, EFFECTS, PIXEL_OPTICS, CURVES, SCENES, PUPILS, LENSES,
+    LAYOUTS, EDITS, RULES, FORMATS, DERIVED_LAYERS, MAP_FORMATS, CUBE_FORMATS, EFFECTS, PIXEL_OPTICS, CURVES, SCENES, DISPLAYS, PUPILS, LENSES,
     METRICS, PSF_FORMATS, COLUMNS,
 )  # fmt: skip
 NUMBERS = count()
@@ -352,6 +352,18 @@ def dithered(shape, pitch_um):
     return corner_image(shape, pitch_um, 0.4) * (1.0 - 0.1 * (np.indices(shape).sum(axis=0) % 2) * (pitch_um < 100.0))
 
 
+LINES = {
+    "wavelength_nm": [450.0, 550.0, 650.0], "primaries": np.eye(3)[::-1], "pitch_um": 200.0, "white_cd_m2": 100.0,
+    "black_cd_m2": 0.5,
+}  # fmt: skip
+
+
+class Backlit(fs.scene.Display):
+    """A display that shows another black than it declares."""
+
+    contrast = 50.0
+
+
 # -- optics -----------------------------------------------------------------------------------------------------------
 
 
@@ -511,6 +523,10 @@ WRONG = [
     (SCENES, dim, PICTURE, CORNER, "must be proportional to radiance_w_m2_sr_nm"),
     (SCENES, near, PICTURE, CORNER, "must have the distance_m of its example, got 2.0"),
     (SCENES, corner, PICTURE, None, "has no known arrangement; register it with expected="),
+    (DISPLAYS, lambda: 3, {}, None, "must return a Display, got int"),
+    (DISPLAYS, lambda: Backlit(**LINES), {}, None, r"shows black and white of \[2.0, 100.0\] cd/m², expected \[0.5, 100.0\]"),
+    (DISPLAYS, lambda: fs.scene.Display(**LINES), {}, ((0.64, 0.33), (0.3, 0.6), (0.15, 0.06)), "has primaries with the chromaticities"),
+    (DISPLAYS, lambda: fs.scene.Display(**LINES | {"pitch_um": float(next(NUMBERS) + 1)}), {}, None, "must be the same in a settings file"),
     (PUPILS, Edgeless, {}, None, r"has discontinuities that are not among its edges\(\)"),
     (PUPILS, Displaced, {}, None, r"has discontinuities that are not among its edges\(\)"),
     (PUPILS, Amplifier, {}, None, "must return amplitudes of at most 1, got 1.2"),

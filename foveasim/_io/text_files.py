@@ -115,16 +115,22 @@ def _with_decimal_points(path: Path, rows: list[tuple[int, list[str]]]) -> list[
 
 
 def read_columns(
-    path: Path, what: str, names: Sequence[str], max_bytes: int, *, has_numbers: bool = True
+    path: Path,
+    what: str,
+    names: Sequence[str],
+    max_bytes: int,
+    *,
+    has_numbers: bool = True,
+    has_comments: bool = False,
 ) -> list[tuple[int, list[str]]]:
     """
     Read columns of a table by the names in its first line.
 
     Returns the number of each line with its cells in the order of ``names``; empty lines and other columns are ignored.
-    ``what``, ``max_bytes``, ``has_numbers``: as for :func:`read_rows`. Raises FileError when the file cannot be read, or a
-    column or a cell is missing.
+    ``what``, ``max_bytes``, ``has_numbers``, ``has_comments``: as for :func:`read_rows`. Raises FileError when the file cannot
+    be read, or a column or a cell is missing.
     """
-    rows = read_rows(path, what, max_bytes, has_numbers=has_numbers)
+    rows = read_rows(path, what, max_bytes, has_numbers=has_numbers, has_comments=has_comments)
     header = rows[0][1] if rows else []
     if not set(names) <= set(header):
         required = " and ".join((", ".join(map(repr, names[:-1])), repr(names[-1])))

@@ -30,7 +30,7 @@ from foveasim.layout.files import Invalid, LengthUnit, Parts
 from foveasim.maps import read_power_map
 from foveasim.modes.frame_times import check_times
 from foveasim.optics import PUPILS, ChiefRayTable, IlluminationTable, LateralColour, Optics, Seidel, Zernike, read_psfs
-from foveasim.scene import SCENES
+from foveasim.scene import DISPLAYS, SCENES
 from foveasim.sensor import (
     PIXEL_OPTICS,
     Diffusion,
@@ -52,7 +52,9 @@ __all__ = ["FILE_OPTIONS", "LayerSection", "Models", "PerArea", "Section", "call
 #: The function or class of each section.
 _CALLS: dict[type[BaseModel], Callable[..., Any]] = {}
 #: Registries whose members are sections: the models are rebuilt when one of these changes.
-_REGISTRIES: tuple[Registry[Any], ...] = (LAYOUTS, EDITS, RULES, SCENES, LENSES, PUPILS, CURVES, EFFECTS, PIXEL_OPTICS)
+_REGISTRIES: tuple[Registry[Any], ...] = (
+    LAYOUTS, EDITS, RULES, SCENES, DISPLAYS, LENSES, PUPILS, CURVES, EFFECTS, PIXEL_OPTICS,
+)  # fmt: skip
 
 _log = logging.getLogger("foveasim")
 
@@ -153,6 +155,14 @@ _FILE_TYPES: dict[str, Any] = {
 _Numbers: Any = float | list[float] | None
 #: Bands of scenes: one wavelength or several.
 _WAVELENGTHS: dict[str, Any] = {"wavelength_nm": _Numbers, "band_width_nm": _Numbers}
+#: Parameters of displays.
+_DISPLAY_TYPES: dict[str, Any] = {
+    "path": str,
+    "wavelength_nm": list[float],
+    "primaries": list[list[float]],
+    "transfer": float | Literal["srgb"] | list[float] | list[list[float]],
+    "cells": list[list[int]] | None,
+}
 _Point = tuple[float, float]
 #: Parameters of layout edits with other types in files than in Python.
 _EDIT_TYPES: dict[str, Any] = {
@@ -277,10 +287,8 @@ def _models(_versions: tuple[int, ...]) -> Models:
     rules = _rules()
     layout = _layout(rules)
     power_map = _model("power_map", read_power_map, **(_FILE_TYPES | _WAVELENGTHS))
-    scene = _union_of(
-        "kind",
-        {**_registered_sections(SCENES, skip=_OF_ARRAYS, **(_FILE_TYPES | _WAVELENGTHS)), "power_map": power_map},
-    )
+    scenes = _registered_sections(SCENES, skip=_OF_ARRAYS, **(_FILE_TYPES | _WAVELENGTHS), display=_display())
+    scene = _union_of("kind", {**scenes, "power_map": power_map})
     fields: dict[str, Any] = {
         "scene": (
             scene,
@@ -339,6 +347,18 @@ def _models(_versions: tuple[int, ...]) -> Models:
     summary = "A shot: scene or power map, optics, distortion, layout, sensor, exposure."
     shot = create_model("ShotSection", __base__=_ShotBase, __doc__=summary, **fields)
     return Models(shot, layout, rules)
+
+
+def _display() -> Any:
+    """Return the type of a display: the name of one without required parameters, or a section."""
+    sections = _registered_sections(DISPLAYS, **_DISPLAY_TYPES)
+    names = [
+        name
+        for name, section in sections.items()
+        if not any(field.is_required() for field in section.model_fields.values())
+    ]
+    named = Annotated[str, Field(json_schema_extra={"enum": names})]
+    return named | _union_of("kind", sections) if sections else named
 
 
 def _rules() -> type[Section]:

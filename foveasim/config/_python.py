@@ -25,6 +25,7 @@ MODULES = {
     "foveasim.layout": "fs.layout",
     "foveasim.scene": "fs.scene",
     "foveasim.scene.charts": "fs.scene.charts",
+    "foveasim.scene.displays": "fs.scene.displays",
     "foveasim.optics": "fs.optics",
     "foveasim.distortion": "fs.distortion",
     "foveasim.sensor": "fs.sensor",

@@ -51,6 +51,8 @@ from foveasim.scene.cubes import (
     select,
     spectral_radiance,
 )
+from foveasim.scene.displays._display import Display, display_of
+from foveasim.scene.displays._raster import raster_of
 from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um, um_from_m
 
@@ -98,7 +100,7 @@ class Scene:
     """
     Spectral radiance of a plane at a given distance in front of the lens.
 
-    Usually created by :meth:`from_picture`, :meth:`from_cube`, :meth:`flat` or :meth:`point_sources`.
+    Usually created by :meth:`from_picture`, :meth:`from_cube`, :meth:`from_display`, :meth:`flat` or :meth:`point_sources`.
 
     Parameters
     ----------
@@ -137,6 +139,8 @@ class Scene:
         reproduces.
     axis_um : (x, y), optional, µm
         With ``fit``, where the optical axis meets the sensor; :meth:`foveasim.Camera.fit_scene` sets it with the pitch.
+    display : Display, optional
+        Display that shows the picture, as the frames of a video with this scene as template: :meth:`from_display`.
 
     Raises
     ------
@@ -178,6 +182,7 @@ class Scene:
     illuminant: Floats | None = field(default=None, kw_only=True)
     is_rgb: bool = field(default=False, kw_only=True)
     axis_um: tuple[float, float] | None = field(default=None, kw_only=True)
+    display: Display | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         check_declared(self)
@@ -286,6 +291,7 @@ class Scene:
             gaze_range_um=(0.0, 0.0),
             field_of_view_deg=None,
             axis_um=None,
+            display=None,
         )
 
     def framed(self, pitch_um: float, axis_um: tuple[float, float] | None) -> Scene:
@@ -646,6 +652,126 @@ class Scene:
         )
 
     @classmethod
+    def from_display(
+        cls,
+        picture: OwnCheck[str | Path | ArrayLike],
+        display: Display | str,
+        *,
+        distance_m: float,
+        subpixels: bool = False,
+        wavelength_nm: Sequence[float] | None = None,
+        band_width_nm: float | Sequence[float] | None = None,
+    ) -> Scene:
+        """
+        Create a scene from a picture that a display shows.
+
+        Parameters
+        ----------
+        picture : path, image of Pillow, or (n_y, n_x) or (n_y, n_x, n_channel) array
+            Digital values, one pixel of the picture for each of the display; formats as for :meth:`from_picture`. Profiles and
+            encodings of files are ignored, as by a display without colour management. Grey pictures have the same value in all
+            primaries; alpha is in front of black.
+        display : Display or str
+            Display, or the name of a bundled one: ``"lcd"`` or ``"oled"`` (:mod:`foveasim.scene.displays`).
+        distance_m : float, m
+            Distance of the display from the lens.
+        subpixels : bool
+            Whether pixels are not uniform, but consist of the cells of the display, which are then the pixels of the scene.
+        wavelength_nm : sequence, optional, nm
+            Wavelengths of the scene, at which spectra are interpolated linearly; by default those of the display. White has the
+            same luminance.
+        band_width_nm : number or sequence, optional, nm
+            Widths of the bands; by default bands extend halfway to the adjacent wavelengths.
+
+        Returns
+        -------
+        Scene
+            One basis image per primary. The pixel pitch is that of the display, or of its cells. White is the illuminant, and
+            displays with the colours of sRGB show the linear sRGB of a photograph (``is_rgb``).
+
+        Raises
+        ------
+        FileError
+            If the picture cannot be read.
+        ParameterError
+            If the picture has no digital values from 0 to 1 for the primaries of the display, or the display has no cells.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> ramp = np.linspace(0.0, 1.0, 5)[np.newaxis]
+        >>> scene = fs.Scene.from_display(ramp, "lcd", distance_m=0.5)
+        >>> scene.luminance_cd_m2.round(2).tolist()  # 0.25 + 249.75 sRGB(v)
+        [[0.25, 12.96, 53.71, 130.75, 250.0]]
+        >>> fs.Scene.from_display(ramp, "lcd", distance_m=0.5, subpixels=True).basis.shape
+        (3, 3, 15)
+        """
+        shown, is_file = display_of(display), isinstance(picture, str | os.PathLike)
+        try:
+            light = raster_of(
+                shown,
+                as_encoded(picture, "srgb"),
+                subpixels=subpixels,
+                wavelength_nm=wavelength_nm,
+                band_width_nm=band_width_nm,
+            )
+        except ParameterError as error:
+            is_of_file = is_file and error.name == "picture"
+            raise (FileError(str(picture), str(error)) if is_of_file else error) from None
+        return cls(
+            freeze(light.basis),
+            light.spectrum_w_m2_sr_nm,
+            light.wavelength_nm,
+            light.band_width_nm,
+            light.pitch_um,
+            distance_m,
+            source=f"{picture if is_file else 'a picture array'} on a display ({shown.source or 'no source'})",
+            illuminant=light.white,
+            is_rgb=shown.has_srgb_colours,
+            display=shown,
+        )
+
+    def on_display(self, picture: OwnCheck[str | Path | ArrayLike]) -> Scene:
+        """
+        Return the scene of another picture on the display of this one.
+
+        Parameters
+        ----------
+        picture : path, image of Pillow, or array
+            As for :meth:`from_display`.
+
+        Returns
+        -------
+        Scene
+            With the distance, position and bands of this scene, and subpixels if it has them.
+
+        Raises
+        ------
+        ParameterError
+            If this scene has no display, or the picture does not have its digital values.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> white = fs.Scene.from_display(np.ones((2, 3)), "oled", distance_m=0.3)
+        >>> white.on_display(np.zeros((2, 3))).luminance_cd_m2.max()
+        np.float64(0.0)
+        """
+        if self.display is None or self.pitch_um is None:
+            raise ParameterError("picture", "requires a scene with a display, such as that of Scene.from_display")
+        scene = type(self).from_display(
+            picture,
+            self.display,
+            distance_m=self.distance_m,
+            subpixels=self.pitch_um < self.display.pitch_um,
+            wavelength_nm=self.wavelength_nm,  # type: ignore[arg-type]
+            band_width_nm=self.band_width_nm,  # type: ignore[arg-type]
+        )
+        return scene.with_centre(self.centre_um)
+
+    @classmethod
     def flat(
         cls,
         *,
@@ -842,6 +968,11 @@ def _example_cube(directory: Path) -> dict[str, Any]:
     return {"path": str(directory / "cube.hdr"), "quantity": "radiance", "unit": "W/m2/sr/nm", **_GEOMETRY}
 
 
+def _example_on_display(directory: Path) -> dict[str, Any]:
+    """Write a picture as that of :func:`_example_picture`."""
+    return {"picture": _example_picture(directory)["picture"], "display": "lcd", "distance_m": 1.0}
+
+
 SCENES.register("picture", Scene.from_picture, example=_example_picture, expected=("#..", "#..", "##."))
 _FLAT = {**_GEOMETRY, **_BAND, "shape": (4, 6), "radiance_w_m2_sr_nm": 0.02}
 SCENES.register("flat", Scene.flat, example=_FLAT, expected=("##", "##"))
@@ -852,3 +983,4 @@ SCENES.register(
     expected=("#....#", "......", "......", "#....."),
 )
 SCENES.register("cube", Scene.from_cube, example=_example_cube, expected=("#..", "##."))
+SCENES.register("display", Scene.from_display, example=_example_on_display, expected=("#..", "#..", "##."))

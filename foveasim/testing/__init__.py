@@ -24,6 +24,7 @@ pixel optics      parameters                                                    
 curve             parameters                                                     mapping of wavelengths, nm, to values
 scene             parameters                                                     picture of cells, top row first: ``#``
                                                                                  for bright, ``.`` for dark, else a space
+display           parameters                                                     chromaticities of the primaries
 pupil             parameters                                                     transmitted fraction of the power
 PSF format        as layout formats; returns a PSFGrid
 lens model        parameters                                                     mapping of ideal to real points, µm
@@ -50,6 +51,7 @@ from foveasim._core.calls import publish
 from foveasim._core.names import possible_names
 from foveasim._io.formats import one_line
 from foveasim.errors import ParameterError
+from foveasim.testing._displays import check_display
 from foveasim.testing._effects import check_effect, check_sensor_effect
 from foveasim.testing._extension import Check, Extension
 from foveasim.testing._files import check_cube_format, check_layout_format, check_map_format, check_psf_format
@@ -69,7 +71,7 @@ CHECKS: dict[str, Check] = {
     for check in (
         check_generator, check_edit, check_rule, check_layout_format, check_derived_layer, check_map_format, check_effect,
         check_pixel_optics,
-        check_curve, check_cube_format, check_scene, check_pupil, check_psf_format, check_lens, check_metric,
+        check_curve, check_cube_format, check_scene, check_display, check_pupil, check_psf_format, check_lens, check_metric,
         check_column,
     )
 }  # fmt: skip

@@ -58,7 +58,8 @@ class FrameSource:
         column ``t_s``.
     template : Scene, optional
         Scene that specifies pitch or framing, distance and spectra of the frames; the pictures replace its basis images.
-        Colours are converted to grey for a template with one basis image, and grey to colour for a template with three.
+        Colours are converted to grey for a template with one basis image, and grey to colour for a template with three. A
+        template with a display shows the frames on it.
     **scene
         Parameters of :meth:`foveasim.Scene.from_picture`: ``fit`` or ``pitch_um``, ``distance_m``,
         ``peak_radiance_w_m2_sr_nm``, and others; with ``template`` only ``encoding``.
@@ -107,8 +108,10 @@ class FrameSource:
         template: Scene | None = None,
         **scene: Any,
     ) -> None:
-        if template is not None and template.basis.shape[0] not in (1, 3):
+        if template is not None and template.display is None and template.basis.shape[0] not in (1, 3):
             raise ParameterError("template", f"must have 1 or 3 basis images, got {template.basis.shape[0]}")
+        if template is not None and template.display is not None and scene:
+            raise ParameterError(min(scene), "must not be given with a template that has a display")
         if template is not None and set(scene) - {"encoding"}:
             raise ParameterError(
                 min(set(scene) - {"encoding"}), "must not be given with 'template', which specifies it"
@@ -268,6 +271,8 @@ class FrameSource:
 
     @staticmethod
     def _from_template(picture: Any, template: Scene, settings: dict[str, Any]) -> Scene:
+        if template.display is not None:
+            return template.on_display(picture)
         n_basis = template.basis.shape[0]
         converted = Scene.from_picture(
             picture,

@@ -42,6 +42,7 @@ EXAMPLES = {
     "projection": "equidistant",
     "custom": {},
     "basis": np.ones((1, 2, 2)),
+    "primaries": [[1.0]],
     "spectrum_w_m2_sr_nm": [[1.0]],
     "wavelength_nm": [550.0],
     "band_width_nm": 10.0,
@@ -127,6 +128,8 @@ def arguments_of(kind, **given):
     }
     if kind is fs.sensor.PassBand:
         required["to_nm"] = 600.0
+    if kind is fs.scene.Display:
+        required |= {"wavelength_nm": [500.0, 550.0], "primaries": [[1.0, 2.0]]}
     if kind is fs.modes.Shutter:
         required["frame_s"] = 0.1
     if issubclass(kind, fs.sensor.effects.Effect) and "fraction" in required:

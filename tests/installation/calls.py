@@ -389,6 +389,9 @@ CALLS = {
     "Scene.from_picture": lambda o: fs.Scene.from_picture(
         o.photos / "cats" / "0.png", pitch_um=100.0, distance_m=0.5, peak_radiance_w_m2_sr_nm=0.05
     ),
+    "Scene.from_display": lambda o: fs.Scene.from_display(
+        o.photos / "cats" / "0.png", "oled", distance_m=0.5, subpixels=True
+    ).on_display(o.photos / "cats" / "1.png"),
     "Camera.video": lambda o: list(o.camera.video([o.scene] * 2, exposure_s=0.01, seed=0)),
     "Camera.noise_budget": lambda o: o.camera.noise_budget(o.scene, exposure_s=0.01).plot(),
     "Camera.compare_with": lambda o: o.twins,
@@ -659,6 +662,11 @@ CALLS = {
     "scene.charts.sine": lambda o: charts.sine(line_pairs_per_mm=0.5, **SHEET),
     "scene.charts.slanted_edge": lambda o: charts.slanted_edge(**SHEET),
     "scene.charts.zone_plate": lambda o: charts.zone_plate(line_pairs_per_mm=1.0, **SHEET).plot(),
+    "scene.displays.lcd": lambda o: fs.scene.displays.lcd(),
+    "scene.displays.oled": lambda o: fs.scene.displays.oled(white_cd_m2=300.0),
+    "scene.Display.from_csv": lambda o: fs.scene.Display.from_csv(
+        o.text(".csv", "wavelength_nm,red,green,blue\n450,0,0,1\n550,0,1,0\n650,1,0,0\n"), pitch_um=250.0
+    ),
     "sensor.calibrate": lambda o: sensor.calibrate(o.sensor, exposure_s=0.01, flat_e=900.0, n_frames=4, seed=0),
     "sensor.camera_filters": lambda o: sensor.camera_filters(),
     "sensor.ccd_qe": lambda o: sensor.ccd_qe(),

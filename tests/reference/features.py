@@ -47,6 +47,13 @@ SCENE_ARGUMENTS: dict[str, dict[str, Any]] = {
     | {"picture": "picture.png", "peak_radiance_w_m2_sr_nm": 0.08, "wavelength_nm": [620.0, 550.0, 450.0]},
     "flat": CHART | GREY,
     "point_sources": CHART | POINTS | {"pixels": [[30, 40], [60, 61], [80, 20]], "intensity_w_sr_nm": 1e-4},
+    "display": {
+        "picture": "picture.png",
+        "distance_m": DISTANCE_M,
+        "wavelength_nm": [620.0, 550.0, 450.0],
+        "subpixels": True,
+        "display": {"kind": "lcd", "pitch_um": PITCH_UM, "white_cd_m2": 5000.0},
+    },
     "cube": GEOMETRY | {"path": "cube.hdr", "quantity": "radiance", "unit": "W/m2/sr/nm"},
     "checkerboard": CHART | RADIANCE | {"square_mm": 6.0},
     "slanted_edge": CHART | GREY,

@@ -122,7 +122,7 @@ def public_objects(directory):
         distortion.DoubleSphere(xi=-0.2, alpha=0.6, focal_um=8000.0), distortion.FieldOfView(w_rad=0.9, focal_um=8000.0),
         distortion.PolynomialFisheye(k=(0.1, 0.0, 0.0, 0.0), focal_um=8000.0), distortion.Scaramuzza(a=(-500.0, 1e-4, 0.0, 0.0), pixel_um=2.0, focal_um=1000.0),
         Found(data=np.ones((3, 100, 100))),
-        fs.scene.Cube(data=np.ones((3, 100, 100))),
+        fs.scene.Cube(data=np.ones((3, 100, 100))), fs.scene.displays.lcd(),
         sensor.BandMean(curve=CURVE, band_width_nm=10.0), sensor.ConstantCurve(0.5), sensor.Diffusion(spread_um=0.5),
         sensor.InterPixelCapacitance(neighbour_fraction=0.01), sensor.KernelCrosstalk(kernel=np.full((5, 5), 0.04).tolist()),
         sensor.ApertureStack(height_um=2.0, refractive_index=1.5, photodiode=SITES), sensor.Microlens(height_um=2.0, refractive_index=1.5),

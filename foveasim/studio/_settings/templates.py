@@ -12,7 +12,7 @@ from foveasim.errors import FoveasimError
 from foveasim.layout import EDITS, LAYOUTS, mosaic
 from foveasim.layout.sizes.sizing import SIZES, initial_parameters
 from foveasim.optics.pupils import PUPILS
-from foveasim.scene.registry import SCENES
+from foveasim.scene.registry import DISPLAYS, SCENES
 from foveasim.sensor import PIXEL_OPTICS
 from foveasim.sensor.effects import EFFECTS
 from foveasim.sensor.spectral import CURVES
@@ -25,6 +25,7 @@ BLOCK = ["RG", "GB"]
 INITIAL: dict[str, Any] = {
     "band_width_nm": 100.0,
     "bits": 10,
+    "display": "lcd",
     "distance_m": 1.0,
     "f_number": 2.8,
     "fit": "cover",
@@ -116,7 +117,7 @@ PER_AREA: dict[str, float] = {
 }
 #: Registries of the sections whose titles in the schema end with a word.
 REGISTRIES: dict[str, tuple[Registry[Any], ...]] = {
-    "kind": (SCENES, LENSES, PUPILS, CURVES, EFFECTS, PIXEL_OPTICS, EDITS),
+    "kind": (SCENES, DISPLAYS, LENSES, PUPILS, CURVES, EFFECTS, PIXEL_OPTICS, EDITS),
     "parameters": (LAYOUTS,),
 }
 

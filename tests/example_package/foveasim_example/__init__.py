@@ -27,7 +27,7 @@ from foveasim.layout import (
 from foveasim.maps import MAP_FORMATS, Found
 from foveasim.metrics import METRICS, MetricInfo
 from foveasim.optics import PSF_FORMATS, PUPILS, PSFGrid
-from foveasim.scene import CUBE_FORMATS, SCENES
+from foveasim.scene import CUBE_FORMATS, DISPLAYS, SCENES, Display
 from foveasim.sensor import PIXEL_OPTICS, Footprints, PixelOptics
 from foveasim.sensor.effects import EFFECTS, AdditiveNoise, Collection
 from foveasim.sensor.spectral import CURVES
@@ -232,6 +232,14 @@ def half_plane(*, shape: tuple[int, int], pitch_um: float, distance_m: float, wa
         wavelength_nm=wavelength_nm,
         band_width_nm=10.0,
         peak_radiance_w_m2_sr_nm=0.02,
+    )
+
+
+@DISPLAYS.register("amber", example={"pitch_um": 300.0}, expected=((0.5125, 0.4866),))
+def amber(*, pitch_um: float = 250.0) -> Display:
+    """A monochrome display with light at 580 nm."""
+    return Display(
+        wavelength_nm=[570.0, 580.0, 590.0], primaries=[[0.0, 1.0, 0.0]], pitch_um=pitch_um, white_cd_m2=90.0
     )
 
 
