@@ -65,7 +65,7 @@ DIMENSIONLESS = {
 }  # fmt: skip
 #: Names in private functions, in cells, pitches, steps or aperture radii as their docstrings specify.
 INTERNAL = {
-    "log_mean", "nodes", "slopes", "variance_slope", "along_y", "at_points", "fields", "profiles", "at", "axes", "before", "blur_cells", "blur_lambda_n", "bound", "bounds", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "homography", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
+    "log_mean", "parts", "nodes", "slopes", "variance_slope", "along_y", "at_points", "fields", "profiles", "at", "axes", "before", "blur_cells", "blur_lambda_n", "bound", "bounds", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "homography", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
     "n_across", "n_source_cells", "moments", "new_radius", "node", "norm", "off_diagonal", "one", "other", "per_step", "pixel", "plane", "points", "quantiles", "r2", "radius", "right", "row", "rows", "s_x", "s_y", "scale", "screen", "side", "sigma", "slope", "spread", "start", "tables_at",
     "tangent2_x", "tangent2_y", "threshold", "to_step", "u", "upper", "v", "x", "x2", "xy", "y", "y2", "sampling", "step", "t", "weigh", "window",
     "error", "freedom", "covariance", "edges", "lines", "log_odds_error", "log_step_error", "names", "noise", "of_blocks", "of_pixels", "own_covariance", "probability", "residuals", "share", "square", "vector",

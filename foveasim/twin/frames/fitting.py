@@ -217,7 +217,7 @@ class _Fit:
             self.step_dn = self.telegraph.step_dn / float(self.adc.width_of_code_dn(np.median(stack.mean_dn)))
 
     def _shot_ratio(self, variance_dn2: Floats) -> Floats | float:
-        """Return the variances that dark frames have by the shot noise of their dark current, over the mean one."""
+        """Return variances of dark pixels by shot noise of dark current, over the mean one."""
         if self.dark_slope_dn is None:
             return 1.0
         best, own = max(self.lit, key=self._brightness), self.classes == 0
@@ -461,7 +461,11 @@ class _Fit:
         )
 
     def _total(self, parts: Mapping[str, tuple[float, Any]]) -> tuple[float, float]:
-        """Return the standard deviation of rows, columns and pixels together, and its relative error, at most 1."""
+        """
+        Return the standard deviation of rows, columns and pixels together.
+
+        With its relative error, at most 1.
+        """
         total = sum(max(variance, 0.0) for variance, _ in parts.values())
         if total == 0.0:
             return 0.0, 0.0
@@ -472,7 +476,7 @@ class _Fit:
         return math.sqrt(total), min(0.5 * math.hypot(*errors) / total, 1.0)
 
     def _currents_dn_per_s(self) -> Floats | None:
-        """Return differences of dark currents from their mean, as far as they are known, (n_y, n_x)."""
+        """Return known differences of dark currents from their mean, (n_y, n_x)."""
         if self.dark_spread is None or self.dark_slope_dn is None or self.dark_slope_noise is None:
             return None
         mean_dn_per_s = self.dark_spread.mean * self.dark_slope
