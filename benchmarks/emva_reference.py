@@ -201,8 +201,13 @@ def rows_of(reference: Any, own: tuple[Any, Any], estimates: Any) -> list[Row]:
         row("DSNU of columns / e-", ("DSNU1288_col", "dsnu_column_e"), "dsnu_column_e", "dsnu_column_e"),
         row("DSNU of pixels / e-", ("DSNU1288_pixel", "dsnu_pixel_e"), "dsnu_pixel_e", "dsnu_e"),
         row("PRNU / %", ("PRNU1288", "prnu_fraction"), "prnu_fraction"),
-        row("PRNU of rows / %", ("PRNU1288_row", "prnu_row_fraction"), "prnu_row_fraction"),
-        row("PRNU of columns / %", ("PRNU1288_col", "prnu_column_fraction"), "prnu_column_fraction"),
+        row("PRNU of rows / %", ("PRNU1288_row", "prnu_row_fraction"), "prnu_row_fraction", "prnu_row_fraction"),
+        row(
+            "PRNU of columns / %",
+            ("PRNU1288_col", "prnu_column_fraction"),
+            "prnu_column_fraction",
+            "prnu_column_fraction",
+        ),
         row("PRNU of pixels / %", ("PRNU1288_pixel", "prnu_pixel_fraction"), "prnu_pixel_fraction", "prnu_fraction"),
     ]
 

@@ -123,6 +123,8 @@ def test_reference_searches_saturation_among_clipped_levels(compared):
         ("read_noise_e", "dark_noise_e", "sigma_d", 1.0),
         ("dark_e_per_s", "dark_current_e_per_s", "u_I_mean", 1.0),
         ("prnu_fraction", "prnu_pixel_fraction", "PRNU1288_pixel", 0.01),
+        ("prnu_row_fraction", "prnu_row_fraction", "PRNU1288_row", 0.01),
+        ("prnu_column_fraction", "prnu_column_fraction", "PRNU1288_col", 0.01),
         *((twin, f"dsnu_{part}_e", f"DSNU1288_{short}", 1.0) for part, short, twin in PARTS),
     ],
 )
