@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 import foveasim as fs
 from foveasim.cli import app
 from foveasim.sensor.effects import RowNoise
+from foveasim.twin.frames.chain import Chain
 from foveasim.twin.frames.statistics import StackStatistics, sum_frames
 
 N_Y, N_X = 48, 64
@@ -364,6 +365,21 @@ def test_intervals_contain_parameters_of_random_cameras():
     for name, each in hits.items():
         assert binom.cdf(sum(each), len(each), 0.95) > 1e-4, (name, sum(each), len(each))
     assert 0.93 <= np.mean(np.concatenate(list(hits.values()))) <= 0.98
+
+
+def test_moments_of_many_bits_need_few_codes():
+    """The chain predicts fewer codes than a sensor of 16 bits, whose noise covers 16 of them, and the same moments."""
+    values = {"gain_dn_per_e": 4.0, "read_noise_e2": 16.0, "black_level_dn": 300.3, "full_well_e": 14_000.0}
+    charges_e = np.array([0.0, 10.0, 3000.0, 13_800.0, 15_500.0])
+    found = Chain({"bits": 16}, 5).moments(values, charges_e, np.zeros(5))
+    sensor = fs.Sensor(
+        fs.layout.grid(n_x=5, n_y=1, pitch_um=1.0), bits=16, gain_dn_per_e=4.0, v_sat_v=1.0, read_noise_e=4.0,
+        pedestal_v=300.8 / 2**16, full_well_e=14_000.0,
+    )  # fmt: skip
+    mean_dn, variance_dn2 = sensor.predict(charges_e)
+
+    np.testing.assert_allclose(found.mean_dn, mean_dn, rtol=1e-9)
+    np.testing.assert_allclose(found.variance_dn2, variance_dn2, rtol=1e-7)
 
 
 def test_row_noise_is_not_noise_of_pixels():

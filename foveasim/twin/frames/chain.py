@@ -15,6 +15,7 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats
 from foveasim.layout.generators.grid import grid
 from foveasim.sensor import Sensor
+from foveasim.sensor.adc import QUANTISATION_DN2
 from foveasim.sensor.effects.measured import OffsetMap
 from foveasim.sensor.published.datasheet import SWING_V
 
@@ -28,6 +29,8 @@ N_PIXELS, LATTICE = 31, (1, 22, 10)
 TAIL = (1 / 256, 1 / 64, 1 / 16, 1 / 4, 1 / 2)
 #: Relative difference of spreads up to which they have the same effect.
 SAME_SPREAD = 0.02
+#: Standard deviation of noise, in codes, from which quantisation adds the variance of a uniform distribution.
+SMOOTH_SIGMA = 2.0
 #: Largest nonlinearity in a search.
 MAX_BEND = 0.45
 #: Standard deviations of the charge below the full well from which it matters, and a full well that does not, e-.
@@ -146,6 +149,18 @@ class Chain:
             "nonlinearity_fraction": min(max(values.get("nonlinearity_fraction", 0.0), -MAX_BEND), MAX_BEND),
         }
 
+    def _step_dn(self, values: Mapping[str, float]) -> int:
+        """
+        Return the width of codes of a coarser ADC that gives the same moments, a power of 2.
+
+        Noise over ``SMOOTH_SIGMA`` codes has the moments of the voltage, but for ``QUANTISATION_DN2``, to 1e-30: means and
+        variances of finer codes follow from those of coarser ones, which are fewer.
+        """
+        if self.known.get("companding", "linear") != "linear" or self.known.get("inl_dn"):
+            return 1
+        sigma_dn = values["gain_dn_per_e"] * math.sqrt(max(values["read_noise_e2"], 0.0))
+        return int(2 ** max(math.floor(math.log2(max(sigma_dn / SMOOTH_SIGMA, 1.0))), 0))
+
     def moments(self, values: Mapping[str, float], light_e: Floats, dark_e: Floats) -> Moments:
         """Return the moments of codes for charges of light and dark current, (n_level,) e- each."""
         responses, offset_e, factors, weights = self.spread.pixels
@@ -165,9 +180,15 @@ class Chain:
             self._layouts[charge_e.size] = grid(n_x=charge_e.size, n_y=1, pitch_um=1.0)
         effects = [OffsetMap(offsets_e[index])] if np.any(offset_e) else []
         parameters = self.parameters(values) | {"full_well_e": well}
+        step = self._step_dn(values)
+        parameters |= {
+            "bits": parameters["bits"] - step.bit_length() + 1,
+            "gain_dn_per_e": values["gain_dn_per_e"] / step,
+        }
         sensor = Sensor(self._layouts[charge_e.size], effects=effects, **parameters)
         mean, variance = sensor.predict(charge_e)
-        slope = np.broadcast_to(sensor.linearise(charge_e).gain_dn_per_e, charge_e.size)
+        mean, variance = step * (mean + 0.5) - 0.5, step**2 * (variance - QUANTISATION_DN2) + QUANTISATION_DN2
+        slope = step * np.broadcast_to(sensor.linearise(charge_e).gain_dn_per_e, charge_e.size)
         # Estimates of a dark current or a noise of 0 are negative for half of the devices: moments continue as straight lines.
         mean = mean + slope * (signed_e - charge_e)
         variance = variance + slope**2 * (signed_e - charge_e + min(values["read_noise_e2"], 0.0))
