@@ -50,6 +50,8 @@ CLOSE_FRACTION = 0.85
 MIN_SHOT_RATIO = 0.2
 #: Gain above which, and read noise below which, codes of whole electrons are more frequent than those between.
 MAX_GAIN, MIN_READ_E = 0.7, 0.6
+#: Rounds of the means of rows and columns of images with missing pixels.
+LINE_ROUNDS = 3
 #: Probability of RTS noise from which a pixel is left out of offsets.
 MAX_RTS = 0.5
 #: Charges of the response by which the signals of hot pixels become charges.
@@ -574,8 +576,12 @@ class _Fit:
         n_y, n_x = values.shape
         in_row, in_column = np.maximum(good.sum(axis=1), 1), np.maximum(good.sum(axis=0), 1)
         clean = np.where(good, values, 0.0)
-        row, column = clean.sum(axis=1) / in_row, clean.sum(axis=0) / in_column
-        left = np.where(good, clean - row[:, None] - column + clean.sum() / good.sum(), 0.0)
+        clean -= good * (clean.sum() / good.sum())
+        row, column = np.zeros(n_y), np.zeros(n_x)
+        for _ in range(LINE_ROUNDS):  # without pixels, means of rows contain columns, and those of columns rows
+            row = (clean.sum(axis=1) - good @ column) / in_row
+            column = (clean.sum(axis=0) - row @ good) / in_column
+        left = np.where(good, clean - row[:, None] - column, 0.0)
         degrees = good.sum() - n_y - n_x + 1
         scale = good.sum() / max(degrees, 1)
         squares = block_means(left**2 * scale - noise, np.where(good, self.classes, -1))
