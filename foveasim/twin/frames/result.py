@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -73,7 +73,7 @@ class Twin:
     estimates: Mapping[str, Estimate]
     not_identifiable: Mapping[str, str]
     maps: Mapping[str, Floats]
-    levels: tuple[Mapping[str, Any], ...]
+    levels: Sequence[Mapping[str, Any]]
     assumptions: tuple[str, ...]
     pixel_um: float
     known: Mapping[str, Any]
