@@ -30,7 +30,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 #: Six floors, each of which imports from those below, and the layers of each, from the bottom: imports from lower layers only.
 #: Modules of a package that are not on its floor have an entry of their own.
 FLOORS = {
-    "ground": [{"errors", "_version"}, {"_core"}, {"units"}, {"_io"}, {"fields", "incidence"}, {"maps"}],
+    "ground": [{"errors", "_version"}, {"_core"}, {"units"}, {"_io"}, {"fields", "incidence", "_projections"}, {"maps"}],
     "physics": [
         {
             "distortion", "integrate", "optics", "scene", "sensor", "layout._kernels", "layout.lattice", "layout.model",
