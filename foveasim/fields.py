@@ -32,6 +32,7 @@ from foveasim._core.validation import (
     unmasked,
     wavelengths_nm,
 )
+from foveasim._projections import ImageProjection
 from foveasim.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -192,6 +193,10 @@ class SceneLike(Protocol):
     @property
     def distance_m(self) -> float:
         """Distance between the scene and the pupil."""
+
+    @property
+    def projection(self) -> ImageProjection:
+        """Projection of the picture: rectilinear for one of a plane in front of the lens."""
 
 
 @dataclass(frozen=True)

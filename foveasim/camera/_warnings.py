@@ -12,7 +12,7 @@ from foveasim._core.validation import Bools, Floats
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import CoverageWarning, ExposureWarning, FoveasimWarning, ParameterError, SamplingWarning, warn
-from foveasim.fields import Grid, PowerMap
+from foveasim.fields import Grid, PointMap, PowerMap
 from foveasim.integrate import Integrator
 from foveasim.layout.model import Layout
 from foveasim.optics import Optics
@@ -52,7 +52,7 @@ class Covered(NamedTuple):
 
     @classmethod
     def of(
-        cls, layout: Layout, bounds_um: Sequence[float], grid: Grid, distortion: Lens | None, n_threads: int
+        cls, layout: Layout, bounds_um: Sequence[float], grid: Grid, distortion: PointMap | None, n_threads: int
     ) -> Covered:
         """
         Return the coverage of a layout by a grid.

@@ -179,7 +179,9 @@ def _shift_gradients_e_per_um(camera: Camera, image: PowerMap, exposure_s: float
     It is 0 for sites that lie partly or entirely off the image.
     """
     grid, layout = image.grid, camera.layout
-    uncovered_um2 = camera.integrator(grid, order=camera.order(image)).uncovered_um2
+    uncovered_um2 = camera.integrator(
+        grid, order=camera.order(image), projection=camera.projection(image)
+    ).uncovered_um2
     moving = copy(camera)  # so that displaced images do not fill the cache of the camera
 
     def expected_e(x_um: float, y_um: float) -> Floats:

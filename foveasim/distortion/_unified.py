@@ -15,6 +15,14 @@ from foveasim.distortion._brown_conrady import BrownConrady, directions
 from foveasim.distortion._fisheye import ANGLE_MARGIN_RAD, _AngularLens
 from foveasim.distortion._registry import LENSES
 
+#: Margin below 180° in radians, where the sum of 1 and the cosine is not accurate.
+BACK_MARGIN_RAD = 1e-6
+
+
+def _with_margin(largest_rad: float) -> float:
+    """Return an angle below the largest one, at which heights diverge or stop increasing."""
+    return min(largest_rad - ANGLE_MARGIN_RAD, math.pi - BACK_MARGIN_RAD)
+
 
 @LENSES.register(
     "omnidirectional",
@@ -74,7 +82,7 @@ class Omnidirectional(_AngularLens):
 
     def _largest_rad(self) -> float:
         # The ray is parallel to the plane, or beyond ξ = 1 touches the sphere.
-        return math.acos(-min(self.xi, 1.0 / self.xi) if self.xi > 0.0 else 0.0) - ANGLE_MARGIN_RAD
+        return _with_margin(math.acos(-min(self.xi, 1.0 / self.xi) if self.xi > 0.0 else 0.0))
 
     @cached_property
     def _distortion(self) -> BrownConrady | None:
@@ -186,7 +194,7 @@ class ExtendedUnified(_AngularLens):
     def _largest_rad(self) -> float:
         ratio = self.alpha / (1.0 - self.alpha) if self.alpha <= 0.5 else (1.0 - self.alpha) / self.alpha
         depth = -ratio * math.sqrt(self.beta)
-        return math.atan2(math.sqrt(max(1.0 - ratio * ratio, 0.0)), depth) - ANGLE_MARGIN_RAD
+        return _with_margin(math.atan2(math.sqrt(max(1.0 - ratio * ratio, 0.0)), depth))
 
 
 @LENSES.register(
@@ -246,7 +254,7 @@ class DoubleSphere(_AngularLens):
     def _largest_rad(self) -> float:
         ratio = self.alpha / (1.0 - self.alpha) if self.alpha <= 0.5 else (1.0 - self.alpha) / self.alpha
         highest = (ratio + self.xi) / math.sqrt(2.0 * ratio * self.xi + self.xi**2 + 1.0)
-        return math.acos(max(-1.0, min(-highest, 1.0))) - ANGLE_MARGIN_RAD
+        return _with_margin(math.acos(max(-1.0, min(-highest, 1.0))))
 
 
 @LENSES.register(
