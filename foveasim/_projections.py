@@ -1,5 +1,5 @@
 """
-Projections of ideal images: image height as a function of the angle to the optical axis.
+Projections of ideal images: image height as a function of the angle to the axis.
 
 Directions are unit vectors (x, y, z): x to the right and y up, as in the upright image, z along the optical axis towards the
 scene. Points are in focal lengths from the axis.

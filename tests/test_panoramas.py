@@ -226,7 +226,7 @@ def test_ideal_projection_needs_no_lens_model(projection):
     np.testing.assert_allclose(ideal, of_model, rtol=1e-4)
 
 
-def test_camera_sees_the_direction_of_its_orientation_upright():
+def test_images_of_panoramas_are_upright():
     """The picture shows what is to the right on the right, and what is above at the top, beyond 90° too."""
     lens = Fisheye(projection="equidistant", focal_um=FOCAL_UM)
     angle_um = FOCAL_UM * math.radians(100.0)
@@ -242,7 +242,7 @@ def test_camera_sees_the_direction_of_its_orientation_upright():
     assert power_over_radiance(lens, layout, behind.turned(yaw_deg=90.0)).argmax() == 0
 
 
-def test_turning_gaze_sees_the_direction_of_the_point():
+def test_turning_gaze_sees_direction_of_point():
     """With ``axis="sensor"``, the centre of the sensor receives the light that the gaze has without turning."""
     lens = Fisheye(projection="equisolid", focal_um=FOCAL_UM)
     layout = fs.layout.grid(n_x=2, n_y=2, pitch_um=FOCAL_UM)

@@ -281,13 +281,13 @@ class Camera:
         [20.0, 20.0]
         """
         chosen = self._optics.projection
-        if scene.panorama is None and scene.projection == "rectilinear" and self._distortion is None:
-            if chosen not in ("auto", "rectilinear"):
-                raise ParameterError(
-                    "distortion",
-                    f"must be given for a photograph of a plane in the {chosen} projection; pass "
-                    f"foveasim.distortion.Fisheye(projection='{chosen}', focal_um=...)",
-                )
+        is_plane = scene.panorama is None and scene.projection == "rectilinear"
+        if is_plane and self._distortion is None and chosen not in ("auto", "rectilinear"):
+            raise ParameterError(
+                "distortion",
+                f"must be given for a photograph of a plane in the {chosen} projection; pass "
+                f"foveasim.distortion.Fisheye(projection='{chosen}', focal_um=...)",
+            )
         if scene.pitch_um is not None:
             return scene
         return self._frame([self, *others], scene, (0.0, 0.0))

@@ -112,7 +112,7 @@ def fit_panorama(
     n_threads: int,
 ) -> Scene:
     """
-    Return the image of a panorama in a projection, as a scene whose pixels are the cells of this image.
+    Return the image of a panorama in a projection, as a scene of its cells.
 
     ``bounds_um``: bounds of the field, (4,), in the image; its cells extend a few cells beyond. ``gaze_um``: the point of the
     sensor towards which the camera turns.

@@ -23,6 +23,8 @@ class Lens(Protocol):
     """
     Protocol of lens models for cameras.
 
+    Models that also have ``direction`` and ``project``, as those of this package, are not limited to 90° from the axis.
+
     Examples
     --------
     >>> import foveasim as fs
@@ -221,7 +223,7 @@ class LensBase:
         raise NotImplementedError
 
     def _to_directions(self, xy: Floats) -> Floats:
-        """Return the directions (n, 3) of normalised points (n, 2) of the sensor; NaN beyond the model."""
+        """Return the directions (n, 3) of normalised points (n, 2); NaN beyond the model."""
         ideal = np.pad(self._backward(xy), ((0, 0), (0, 1)), constant_values=1.0)
         return np.asarray(ideal / np.sqrt(np.square(ideal).sum(axis=1, keepdims=True)))
 

@@ -93,9 +93,10 @@ def _interpolant(table: IlluminationTable) -> Callable[[Floats], Floats]:
 
 def solid_angles_sr(grid: Grid, focal_um: float, projection: ImageProjection, *, is_flat: bool) -> Floats:
     """
-    Return the mean solid angle per area of the cells of an image, in focal lengths: (n_y, n_x) sr.
+    Return the mean solid angle per area of the cells of an image, (n_y, n_x) sr.
 
-    ``is_flat``: times the cosine of the angle to the axis, for a flat pupil. 0 beyond the largest angle of the projection.
+    Areas are in squared focal lengths. ``is_flat``: times the cosine of the angle to the axis, for a flat pupil. Beyond the
+    largest angle of the projection it is 0.
     """
     law = LAWS[projection]
     x, y = (

@@ -1056,7 +1056,7 @@ class Optics(PointImages):
 
     def _law_at_pixels(self, scene: SceneLike) -> Floats:
         """
-        Return the relative illumination of the pixels of an image that is not rectilinear, (n_y, n_x).
+        Return the relative illumination of an image that is not rectilinear, (n_y, n_x).
 
         The projected area of the pupil relative to that on the axis, times the solid angle per area of the image.
         """

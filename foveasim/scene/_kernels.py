@@ -23,7 +23,7 @@ def look_up(pixels, table, out):
 
 @njit()
 def _below(sums, u, v):
-    """Return the sum of a picture to the left of u and below v, bilinear between the corners of pixels."""
+    """Return the sum of a picture to the left of u and below v, bilinear in pixels."""
     n_y, n_x = sums.shape[0] - 1, sums.shape[1] - 1
     row, column = min(max(int(np.floor(v)), 0), n_y - 1), min(max(int(np.floor(u)), 0), n_x - 1)
     t, s = v - row, u - column
@@ -34,7 +34,7 @@ def _below(sums, u, v):
 
 @njit()
 def _below_turns(sums, u, v, is_periodic):
-    """Return the sum to the left of u; periodic pictures continue beyond their left and right sides."""
+    """Return the sum to the left of u; periodic pictures continue at their sides."""
     if not is_periodic:
         return _below(sums, u, v)
     n_x = float(sums.shape[1] - 1)
@@ -58,11 +58,11 @@ def _below_turns(sums, u, v, is_periodic):
 )
 def box_means(table, of_rows, u0, u1, v0, v1, weight, n_points, is_periodic, out):
     """
-    Write the means of cells (n_basis, n_y, n_x): weighted means of boxes of a picture, n_points x n_points per cell.
+    Write the means of cells (n_basis, n_y, n_x): weighted means of boxes of a picture.
 
-    ``table`` (n_basis, n_row + 1, n_column + 1): sums of the picture times the weight of its rows. ``of_rows`` (n_row + 1,):
-    sums of these weights. ``u0`` to ``v1``: sides of the boxes, in the order of points (n_y n_points, n_x n_points). Empty
-    boxes are 0.
+    Each cell has n_points x n_points boxes. ``table`` (n_basis, n_row + 1, n_column + 1): sums of the picture times the weight
+    of its rows. ``of_rows`` (n_row + 1,): sums of these weights. ``u0`` to ``v1``: sides of the boxes, in the order of points
+    (n_y n_points, n_x n_points). Empty boxes are 0.
     """
     n_y, n_x = out.shape[1], out.shape[2]
     last = of_rows.size - 2

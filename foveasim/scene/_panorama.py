@@ -91,7 +91,7 @@ class Panorama:
             raise ParameterError(name, "requires mapping='fisheye'", getattr(self, name))
 
     def check_shape(self, shape: tuple[int, ...]) -> None:
-        """Raise ParameterError if pictures (n_y, n_x) do not have the shape of the mapping."""
+        """Raise ParameterError if pictures (n_y, n_x) do not fit the mapping."""
         n_y, n_x = shape
         if self.mapping == "equirectangular" and n_x != 2 * n_y:
             raise ParameterError(
@@ -119,7 +119,7 @@ class Panorama:
         return _turned(yaw, pitch) @ rolled @ _turned(azimuth, elevation)
 
     def n_cells(self, shape: tuple[int, ...], extent: float) -> int:
-        """Return the number of cells along the longer side of an image, which extends over focal lengths."""
+        """Return the cells along the longer side of an image, of ``extent`` focal lengths."""
         if self.cells != "auto":
             return self.cells
         n_y, n_x = shape
@@ -135,11 +135,11 @@ class Panorama:
         self, basis: Images, projection: ImageProjection, shape: tuple[int, int], pitch: float, n_threads: int
     ) -> Images:
         """
-        Return the mean radiance over the solid angle of each cell of an image, (n_basis, n_y, n_x) float32.
+        Return the mean radiance over the solid angle of each cell of an image.
 
-        ``shape``, ``pitch``: numbers of cells, and their size in focal lengths; the image is centred on the axis. Each cell is
-        the mean of 2 x 2 boxes, which contain fractions of pixels: there is no aliasing, whatever the size of the pixels.
-        Cells beyond the largest angle of the projection are 0.
+        The result is (n_basis, n_y, n_x) float32. ``shape``, ``pitch``: numbers of cells, and their size in focal lengths; the
+        image is centred on the axis. Each cell is the mean of 2 x 2 boxes, which contain fractions of pixels: there is no
+        aliasing, whatever the size of the pixels. Cells beyond the largest angle of the projection are 0.
         """
         from foveasim.scene import _kernels
 
@@ -234,7 +234,7 @@ def _equirectangular_boxes(directions: Floats, solid_sr: Floats, shape: tuple[in
 
 
 def _cubemap_boxes(directions: Floats, solid_sr: Floats, shape: tuple[int, int]) -> Boxes:
-    """Faces of a horizontal cross: left, front, right and back, with top and bottom at the front."""
+    """Return the boxes of pixels of a horizontal cross of faces, as above."""
     side = shape[0] / CROSS[1]
     x, y, z = directions.T
     depth = np.abs(directions).max(axis=1)

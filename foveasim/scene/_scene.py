@@ -1,4 +1,4 @@
-"""Scene: spectral radiance of a plane in front of the lens."""
+"""Scene: spectral radiance of a plane in front of the lens, or by direction."""
 
 from __future__ import annotations
 

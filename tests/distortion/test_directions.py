@@ -127,7 +127,7 @@ def test_directions_match_published_formulas(name):
     assert np.abs(found - d).max() < 1e-9
 
 
-def test_unified_model_with_distortion_inverts_beyond_90_degrees():
+def test_distorted_unified_model_inverts_beyond_90_degrees():
     """OpenCV's omnidir: x_d = x (1 + k1 r² + k2 r⁴) + 2 p1 x y + p2 (r² + 2 x²), with y down."""
     lens = Omnidirectional(xi=1.1, focal_um=FOCAL_UM, k1=-0.05, k2=0.004, p1=-0.001, p2=0.002)
     d = directions_up_to(105.0)
@@ -195,7 +195,7 @@ def test_directions_of_ideal_points_are_theirs(lens):
     np.testing.assert_allclose(lens.project(found), lens.distort(ideal_um), atol=1e-8)
 
 
-def test_points_beyond_the_field_are_masked_or_errors():
+def test_points_beyond_the_field_are_errors():
     lens = Fisheye(projection="equidistant", focal_um=100.0)
     with pytest.raises(
         GeometryError, match=r"1 points have no direction: the nearest lies 320 µm .* up to 314\.159 µm"

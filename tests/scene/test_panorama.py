@@ -105,7 +105,7 @@ def test_light_of_random_pixels_is_conserved(orientation):
     assert found == pytest.approx(expected, rel=1e-3)
 
 
-def test_narrow_features_are_not_lost_at_the_pole():
+def test_poles_keep_narrow_features():
     """Alternating columns converge at the zenith, where a cell contains thousands of pixels, to their mean."""
     picture = np.tile([0.0, 1.0], (512, 512))
     found = means(picture, 101, 0.5, pitch_deg=90.0)
