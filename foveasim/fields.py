@@ -8,7 +8,7 @@ two orders.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
 
 import numpy as np
@@ -303,6 +303,8 @@ class PowerMap:
         Grid of the cells.
     wavelength_nm : (n_band,) float64, nm
         Wavelength of each band.
+    projection : {"rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"}
+        Projection of the image in the plane of the map, from which a camera with a lens model derives directions.
 
     Raises
     ------
@@ -321,6 +323,7 @@ class PowerMap:
     data: Images
     grid: Grid
     wavelength_nm: Floats
+    projection: ImageProjection = field(default="rectilinear", kw_only=True)
 
     def __post_init__(self) -> None:
         data = np.asarray(unmasked("data", self.data))

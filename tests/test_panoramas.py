@@ -288,3 +288,61 @@ def test_isotropic_points_require_a_plane():
     )
     with pytest.raises(ParameterError, match="'emission' must be 'lambertian' for the equidistant projection"):
         camera.photoelectrons_per_s(panorama(radiance, 64))
+
+
+def test_power_maps_keep_the_projection(tmp_path):
+    lens = Fisheye(projection="equisolid", focal_um=FOCAL_UM)
+    sensor = fs.Sensor(fs.layout.grid(n_x=6, n_y=6, pitch_um=8000.0))
+    camera = fs.Camera(optics=optics(), sensor=sensor, distortion=lens)
+    scene = panorama(radiance, 64)
+    power_map = camera.power_map(scene)
+    assert power_map.projection == camera.projection(scene) == camera.projection(power_map) == "equisolid"
+    expected = camera.photoelectrons_per_s(scene)
+    np.testing.assert_allclose(camera.photoelectrons_per_s(power_map), expected, rtol=1e-12)
+    with pytest.raises(ParameterError, match="'power_map' must be rectilinear for a file, got an equisolid image"):
+        fs.write_power_map(power_map, tmp_path / "map.npz")
+    with pytest.raises(ParameterError, match="'power_map' must be rectilinear, got an equisolid image"):
+        fs.distortion.distort_map(power_map, lens)
+
+
+def test_photographs_of_planes_require_a_lens_model():
+    plane = fs.Scene.flat(shape=(64, 64), pitch_um=1e5, distance_m=10.0, luminance_cd_m2=1.0)
+    camera = fs.Camera(optics=optics(projection="equidistant"), sensor=fs.Sensor(fs.layout.grid(4, 4, 100.0)))
+    with pytest.raises(
+        ParameterError, match="'distortion' must be given for a photograph of a plane in the equidistant"
+    ):
+        camera.photoelectrons_per_s(plane)
+    # With a model, the projection of the intermediate image of a plane remains rectilinear.
+    lens = Fisheye(projection="equidistant", focal_um=FOCAL_UM)
+    found, expected = (
+        fs.Camera(optics=each, sensor=camera.sensor, distortion=lens).photoelectrons_per_s(plane)
+        for each in (camera.optics, optics())
+    )
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_fisheye_photograph_and_its_panorama_agree():
+    """A photograph of an equirectangular panorama by a calibrated lens, seen by another camera."""
+    n, pixel_um = 801, 60.0
+    lens = fs.distortion.from_opencv(
+        [[330.0, 0.0, 402.0], [0.0, 330.0, 398.5], [0.0, 0.0, 1.0]],
+        [-0.02, 0.003, -0.0007, 0.00004],
+        image_size=(n, n),
+        pixel_um=pixel_um,
+        fisheye=True,
+    )
+    x, y = np.meshgrid((np.arange(n) - 0.5 * (n - 1)) * pixel_um, (0.5 * (n - 1) - np.arange(n)) * pixel_um)
+    d = lens.direction(np.stack((x, y), axis=-1), outside="mask")
+    options = {"peak_radiance_w_m2_sr_nm": 1.0, "wavelength_nm": [550.0], "band_width_nm": 1.0, "encoding": "linear"}
+    photograph = fs.Scene.from_panorama(
+        np.nan_to_num(radiance(*np.moveaxis(d, -1, 0))),
+        mapping="fisheye",
+        lens=lens,
+        pixel_um=pixel_um,
+        cells=512,
+        **options,
+    )
+    layout = fs.layout.grid(n_x=6, n_y=6, pitch_um=FOCAL_UM / 5.0)
+    model = Fisheye(projection="stereographic", focal_um=FOCAL_UM)
+    expected = power_over_radiance(model, layout, panorama(radiance, 512, cells=512))
+    np.testing.assert_allclose(power_over_radiance(model, layout, photograph), expected, rtol=5e-4)

@@ -329,17 +329,15 @@ class Camera:
         Returns
         -------
         {"rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"}
-            That of ``Optics(projection=...)``. If it is ``"auto"``: rectilinear for a photograph of a plane and for a power
-            map; for a panorama the one nearest to the lens model within the bounds of the layout.
+            That of a power map or of a picture. For a panorama that of ``Optics(projection=...)``; if it is ``"auto"``, the
+            one nearest to the lens model within the bounds of the layout, rectilinear without a model.
         """
-        if isinstance(light, Scene) and light.panorama is None:
+        if isinstance(light, PowerMap) or light.panorama is None:
             return light.projection
         chosen = self._optics.projection
         if chosen != "auto":
             return chosen
-        if isinstance(light, PowerMap) or self._distortion is None:
-            return "rectilinear"
-        return self._nearest_projection
+        return "rectilinear" if self._distortion is None else self._nearest_projection
 
     @cached_property
     def _nearest_projection(self) -> ImageProjection:
@@ -465,7 +463,7 @@ class Camera:
         """
         scene = self._scene_at_gaze(scene)
         power_map = self._optics.resolve_oversample(scene).power_map(scene, n_threads=self._n_threads)
-        return PowerMap(power_map.data, self.sensor_frame(scene).image(power_map.grid), power_map.wavelength_nm)
+        return replace(power_map, grid=self.sensor_frame(scene).image(power_map.grid))
 
     def integrator(
         self,

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from copy import copy
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -186,7 +187,7 @@ def _shift_gradients_e_per_um(camera: Camera, image: PowerMap, exposure_s: float
 
     def expected_e(x_um: float, y_um: float) -> Floats:
         x0_um, y0_um = grid.origin_um
-        moved = PowerMap(image.data, Grid(grid.shape, grid.pitch_um, (x0_um + x_um, y0_um + y_um)), image.wavelength_nm)
+        moved = replace(image, grid=Grid(grid.shape, grid.pitch_um, (x0_um + x_um, y0_um + y_um)))
         return camera.sensor.expected_electrons(moving.photoelectrons_per_s(moved), exposure_s)
 
     gradient = np.empty((layout.n_sites, 2))

@@ -603,7 +603,7 @@ class Optics(PointImages):
         data = np.empty((n_bands, *grid.shape), self._real_type())
         for band, cells in enumerate(self.weighted_maps(scene, np.eye(n_bands), n_threads=n_threads)):
             data[band] = cells
-        return PowerMap(read_only(data), grid, scene.wavelength_nm)
+        return PowerMap(read_only(data), grid, scene.wavelength_nm, projection=scene.projection)
 
     def weighted_maps(
         self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int | None = None
