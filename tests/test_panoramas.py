@@ -147,6 +147,7 @@ def test_smooth_panorama_equals_quadrature_over_directions(name, kind):
         np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
+@pytest.mark.slow(keep=1)
 @pytest.mark.parametrize("tilt", ["turning", "flat"])
 def test_uniform_panorama_gives_closed_forms_of_sectors(tilt):
     """Sectors: Δφ (cos θ1 - cos θ2), or Δφ (sin² θ2 - sin² θ1) / 2 behind a flat pupil, with exact edges by quadrature."""
@@ -159,6 +160,7 @@ def test_uniform_panorama_gives_closed_forms_of_sectors(tilt):
     np.testing.assert_allclose(found, expected, rtol=2e-6 if tilt == "turning" else 4e-5)
 
 
+@pytest.mark.slow
 def test_hemisphere_and_sphere_have_closed_forms():
     """A site of the whole field of 90° collects π for a flat pupil and 2π for one that turns."""
     angle = 2.0 * math.pi * np.arange(720) / 720

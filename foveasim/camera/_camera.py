@@ -83,7 +83,8 @@ class Camera:
     axis : {"image", "sensor"}
         What the optical axis is fixed to when the gaze moves. ``"image"``: the sensor moves behind a fixed lens; relative
         illumination, aberrations and distortion stay with the image, which is computed once for all gazes of a video.
-        ``"sensor"``: the camera turns towards the gaze; they stay with the sensor, and the image is computed for each gaze.
+        ``"sensor"``: the camera turns towards the gaze; they stay with the sensor, and the image is computed for each gaze. In
+        a panorama, the gaze is the direction of its point.
     n_threads : int, optional
         Number of threads, by default one per core. Results are bit-identical for any number.
 

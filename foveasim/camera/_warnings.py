@@ -112,9 +112,8 @@ def warn_of_coverage(
             where = f" at the gaze {format_point(gaze_um)} µm"
         if fit == "cover":
             x_um, y_um = np.abs(gaze_um if gaze_um is not None else (0.0, 0.0))
-            remedy = (
-                f"use Scene.from_picture(..., gaze_range_um=({x_um:.4g}, {y_um:.4g})), or gazes nearer to the centre"
-            )
+            call = "from_picture" if isinstance(source, Scene) and source.panorama is None else "from_panorama"
+            remedy = f"use Scene.{call}(..., gaze_range_um=({x_um:.4g}, {y_um:.4g})), or gazes nearer to the centre"
         warn(
             f"{n_uncovered:,} of {n_sites:,} photosites lie partly or completely outside the image{where}, where "
             f"irradiance is 0: the image measures {_format_extent(image_um)}, the layout {_format_extent(layout_um)}; "

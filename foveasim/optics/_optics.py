@@ -126,9 +126,9 @@ class Optics(PointImages):
         as corrected photographic lenses do. The second is higher by 1.6 % at f/4, 3.2 % at f/2.8, 13 % at f/1.4.
     projection : {"auto", "rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"}
         Projection of the image: the image height f tan θ, f θ, 2 f sin(θ/2), 2 f tan(θ/2) or f sin θ of a ray at the angle θ
-        to the axis. Without a lens model it is that of the lens. With one, it is that of the intermediate image, on which
-        results do not depend. ``"auto"``: rectilinear, except for panoramas, of which a camera with a lens model computes the
-        image in the projection nearest to the model.
+        to the axis, of a panorama. Without a lens model it is that of the lens. With one, it is that of the intermediate image,
+        on which results do not depend. ``"auto"``: that nearest to the lens model of a camera, rectilinear without one. The
+        image of a plane is rectilinear; for others, a camera needs a lens model.
     pupil_tilt : {"auto", "flat", "turning"}
         Whether the entrance pupil is a flat disc, which a ray at the angle θ meets with the area π a² cos θ, or turns towards
         the field, as in most fisheye lenses, with the area π a². Relative illumination is the area times the solid angle per

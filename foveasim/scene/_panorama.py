@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foveasim._core.calls import POSITIVE, Limits, OwnCheck, check_declared
 from foveasim._core.threads import parallel_map
@@ -22,6 +23,8 @@ N_POINTS = 2
 CELLS_PER_PIXEL, MIN_CELLS, MAX_CELLS = 2, 64, 2048
 #: Points that are processed at once, in the cache of a core.
 POINTS_PER_BLOCK = 2**15
+#: Sums of pixels that are in memory together, 512 MiB.
+MAX_SUMS = 2**26
 #: Cosine of the elevation, at the poles of an equirectangular picture.
 MIN_COSINE = 1e-9
 #: Angles of the orientation.
@@ -141,6 +144,16 @@ class Panorama:
         image is centred on the axis. Each cell is the mean of 2 x 2 boxes, which contain fractions of pixels: there is no
         aliasing, whatever the size of the pixels. Cells beyond the largest angle of the projection are 0.
         """
+        cells = np.zeros((basis.shape[0], *shape), np.float32)
+        n_together = max(1, MAX_SUMS // (basis.shape[1] * basis.shape[2]))
+        for first in range(0, basis.shape[0], n_together):
+            part = slice(first, first + n_together)
+            self._fill(basis[part], projection, pitch, n_threads, cells[part])
+        return read_only(cells)
+
+    def _fill(
+        self, basis: Images, projection: ImageProjection, pitch: float, n_threads: int, cells: NDArray[np.float32]
+    ) -> None:
         from foveasim.scene import _kernels
 
         law, rotation = LAWS[projection], self.rotation
@@ -149,8 +162,7 @@ class Panorama:
         for image, sums in zip(basis, table, strict=True):
             np.cumsum(np.cumsum(image * weights[:, np.newaxis], axis=0, dtype=np.float64), axis=1, out=sums[1:, 1:])
         of_rows = np.concatenate(([0.0], np.cumsum(weights)))
-        n_y, n_x = shape
-        cells = np.zeros((basis.shape[0], n_y, n_x), np.float32)
+        _, n_y, n_x = cells.shape
         n_rows = max(1, POINTS_PER_BLOCK // (N_POINTS * N_POINTS * n_x))
         step = pitch / N_POINTS
         x = (np.arange(N_POINTS * n_x) - 0.5 * (N_POINTS * n_x - 1)) * step
@@ -177,7 +189,6 @@ class Panorama:
             )
 
         parallel_map(fill, range(0, n_y, n_rows), n_threads)
-        return read_only(cells)
 
     def _row_weights(self, n_y: int) -> Floats:
         """Return the relative solid angle of the pixels of each row."""

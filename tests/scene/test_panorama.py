@@ -118,6 +118,14 @@ def test_poles_keep_narrow_features():
     assert (means(picture, 400, 0.4, pitch_deg=90.0) * solid_sr).sum() == pytest.approx(sr, rel=0.02)
 
 
+def test_channels_are_those_of_single_pictures(monkeypatch):
+    """Panoramas whose sums exceed the memory limit are processed channel by channel."""
+    pictures = np.random.default_rng(1).random((3, 32, 64)).astype(np.float32)
+    together = Panorama().cell_means(pictures, "equisolid", (20, 24), 0.1, 1)
+    monkeypatch.setattr("foveasim.scene._panorama.MAX_SUMS", 1)
+    np.testing.assert_array_equal(Panorama().cell_means(pictures, "equisolid", (20, 24), 0.1, 2), together)
+
+
 def test_orientation_turns_the_camera():
     """The camera sees straight ahead what is to the right, above, or tilted."""
 
