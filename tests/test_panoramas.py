@@ -348,3 +348,44 @@ def test_fisheye_photograph_and_its_panorama_agree():
     model = Fisheye(projection="stereographic", focal_um=FOCAL_UM)
     expected = power_over_radiance(model, layout, panorama(radiance, 512, cells=512))
     np.testing.assert_allclose(power_over_radiance(model, layout, photograph), expected, rtol=5e-4)
+
+
+def test_frames_of_panoramas_keep_the_orientation(tmp_path):
+    """A folder of pictures with a panorama as template is a video of panoramas."""
+    from PIL import Image
+
+    random = np.random.default_rng(2)
+    for k in range(2):
+        Image.fromarray(random.integers(0, 255, (16, 32), np.uint8)).save(tmp_path / f"{k}.png")
+    template = fs.Scene.from_panorama(np.ones((16, 32)), luminance_cd_m2=300.0, pitch_deg=-20.0)
+    frames = list(fs.video.FrameSource(tmp_path, template=template))
+    expected = fs.Scene.from_panorama(tmp_path / "1.png", luminance_cd_m2=300.0, pitch_deg=-20.0)
+    assert frames[1].panorama == expected.panorama
+    camera = fs.Camera(
+        optics=optics(),
+        sensor=fs.Sensor(fs.layout.grid(4, 4, 8000.0)),
+        distortion=Fisheye(projection="equidistant", focal_um=FOCAL_UM),
+    )
+    np.testing.assert_allclose(camera.photoelectrons_per_s(frames[1]), camera.photoelectrons_per_s(expected), rtol=1e-6)
+
+
+def test_own_lens_models_image_panoramas():
+    """A model without directions images the field in front of the lens."""
+
+    class Magnifier:
+        focal_um, centre_um = FOCAL_UM, (0.0, 0.0)
+
+        def distort(self, xy_um, *, outside="error"):
+            return 1.25 * np.asarray(xy_um)
+
+        def undistort(self, xy_um, *, outside="error"):
+            return np.asarray(xy_um) / 1.25
+
+    layout = fs.layout.grid(4, 4, 6000.0)
+    scene = panorama(radiance, 256, cells=256)
+    found = {
+        projection: power_over_radiance(Magnifier(), layout, scene, projection=projection, pupil_tilt="flat")
+        for projection in ("auto", "rectilinear", "equidistant")
+    }
+    np.testing.assert_array_equal(found["auto"], found["rectilinear"])
+    np.testing.assert_allclose(found["equidistant"], found["rectilinear"], rtol=5e-4)
