@@ -211,11 +211,17 @@ def _light_settings(camera: Camera, light: Scene | PowerMap) -> dict[str, object
             "grid": to_plain_data(light.grid),
             "wavelength_nm": light.wavelength_nm.tolist(),
         }
+    framed, panorama = camera.fit_scene(light), light.panorama
+    # The settings of a plane do not mention the projection.
+    directions = {} if framed.projection == "rectilinear" and panorama is None else {"projection": framed.projection}
+    if panorama is not None:
+        directions |= {"panorama": to_plain_data(panorama)}
     return {
         "kind": "Scene",
         "source": light.source,
         "shape": list(light.basis.shape),
-        "pitch_um": camera.fit_scene(light).pitch_um,
+        "pitch_um": framed.pitch_um,
+        **directions,
         "fit": light.fit,
         "field_of_view_deg": light.field_of_view_deg,
         "distance_m": light.distance_m,

@@ -22,7 +22,7 @@ from foveasim.errors import ParameterError, SamplingWarning, warn
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.incidence import N_RINGS, N_RINGS_OF_PUPILS, ChiefRayTable, Incidence, cone_irradiance_sr
 from foveasim.optics._aperture import Aperture, PSFModel, Wavefront, overlaps
-from foveasim.optics._illumination import IlluminationTable
+from foveasim.optics._illumination import IlluminationTable, solid_angles_sr
 from foveasim.optics._point_images import Point, PointImages
 from foveasim.optics.aberrations import LateralColour, Seidel, Zernike
 from foveasim.optics.otf import MAX_ALIASES, ONE_POINT, PlaneTables, RadialTables, TableCache, Tables
@@ -124,6 +124,15 @@ class Optics(PointImages):
         On-axis irradiance for a Lambertian scene of radiance L and the image-side f-number N: ``π L / (1 + 4 N²)`` for the
         thin lens of the paper and ISETCam, or ``π L / (4 N²)`` for an aplanatic lens, which satisfies Abbe's sine condition,
         as corrected photographic lenses do. The second is higher by 1.6 % at f/4, 3.2 % at f/2.8, 13 % at f/1.4.
+    projection : {"auto", "rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"}
+        Projection of the image: the image height f tan θ, f θ, 2 f sin(θ/2), 2 f tan(θ/2) or f sin θ of a ray at the angle θ
+        to the axis, of a panorama. Without a lens model it is that of the lens. With one, it is that of the intermediate image,
+        on which results do not depend. ``"auto"``: that nearest to the lens model of a camera, rectilinear without one. The
+        image of a plane is rectilinear; for others, a camera needs a lens model.
+    pupil_tilt : {"auto", "flat", "turning"}
+        Whether the entrance pupil is a flat disc, which a ray at the angle θ meets with the area π a² cos θ, or turns towards
+        the field, as in most fisheye lenses, with the area π a². Relative illumination is the area times the solid angle per
+        area of the image: cos⁴ θ or cos³ θ for a rectilinear image. ``"auto"``: flat for rectilinear images, else turning.
     transmission : float
         Power transmittance of the glass.
     pupil : Annulus, Spider, Blades, Slit, PupilImage, callable, or a sequence of them, optional
@@ -216,6 +225,8 @@ class Optics(PointImages):
     f_number: Annotated[float, F_NUMBER, Usual(1.0, 32.0)]
     emission: Literal["lambertian", "isotropic"] = "lambertian"
     lens: Literal["thin", "aplanatic"] = "thin"
+    projection: Literal["auto", "rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"] = "auto"
+    pupil_tilt: Literal["auto", "flat", "turning"] = "auto"
     transmission: Annotated[float, Limits(above=0.0, at_most=1.0)] = 1.0
     pupil: OwnCheck[Pupil | Sequence[Pupil] | None] = None
     zernike: Zernike | None = None
@@ -266,11 +277,20 @@ class Optics(PointImages):
             object.__setattr__(self, "exit_pupil_mm", distance_mm)
             if self.chief_ray is not None:
                 raise ParameterError("exit_pupil_mm", "must not be given with 'chief_ray'", distance_mm, "mm")
+        self._require_lambertian(self.projection)
         if self.field_patches is not None and self.is_varying and self.padding == "periodic":
             raise ParameterError(
                 "padding",
                 "must not be 'periodic' with 'field_patches'",
                 hint="choose 'reflect', 'edge' or 'zero', or omit 'field_patches': patches beyond the picture are undefined",
+            )
+
+    def _require_lambertian(self, projection: str) -> None:
+        if projection not in ("auto", "rectilinear") and self.emission != "lambertian":
+            raise ParameterError(
+                "emission",
+                f"must be 'lambertian' for the {projection} projection: isotropic points are those of a plane",
+                self.emission,
             )
 
     # -- geometry -------------------------------------------------------------------------------------------------
@@ -583,7 +603,7 @@ class Optics(PointImages):
         data = np.empty((n_bands, *grid.shape), self._real_type())
         for band, cells in enumerate(self.weighted_maps(scene, np.eye(n_bands), n_threads=n_threads)):
             data[band] = cells
-        return PowerMap(read_only(data), grid, scene.wavelength_nm)
+        return PowerMap(read_only(data), grid, scene.wavelength_nm, projection=scene.projection)
 
     def weighted_maps(
         self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int | None = None
@@ -745,6 +765,9 @@ class Optics(PointImages):
             weights = np.tile(weights, n_modes)
         tangent2_x, tangent2_y = self._squared_tangents(scene)
         illumination = self._illumination(pixels, aperture, scene.distance_m)
+        basis = scene.basis
+        if illumination is None and scene.projection != "rectilinear":
+            illumination, basis = [], np.multiply(basis, self._law_at_pixels(scene), dtype=self._real_type())
         if illumination is not None:
             tangent2_x, tangent2_y = np.zeros_like(tangent2_x), np.zeros_like(tangent2_y)
         # Cache key: a factor depends on these, the lens and the weights.
@@ -763,7 +786,7 @@ class Optics(PointImages):
             return lambda first, last: cached[first:last]
 
         imaging = Imaging(
-            basis=scene.basis,
+            basis=basis,
             irradiance_w_m2=irradiance_w_m2
             * (_pitch_um(scene) * self._view(scene).magnification / pixels.pitch_x_um) ** 2,
             weights=weights,
@@ -771,7 +794,7 @@ class Optics(PointImages):
             illumination=illumination or [],
             tangent2_x=tangent2_x,
             tangent2_y=tangent2_y,
-            falloff_power=4 if self.emission == "lambertian" else 3,
+            falloff_power=(4 if self.emission == "lambertian" else 3) - (self.pupil_tilt == "turning"),
             grid=pixels,
             padding=self.padding,
             pad=self._reach_cells(scene, pixels, aperture, lambda_n_um, LOST_FRACTION)
@@ -1030,6 +1053,21 @@ class Optics(PointImages):
                 1.0, height_um / float(um_from_m(m_from_mm(self._image_distance_mm(distance_m))))
             )
         return np.asarray(values)
+
+    def _law_at_pixels(self, scene: SceneLike) -> Floats:
+        """
+        Return the relative illumination of an image that is not rectilinear, (n_y, n_x).
+
+        The projected area of the pupil relative to that on the axis, times the solid angle per area of the image.
+        """
+        self._require_lambertian(scene.projection)
+        grid, distance_m = self.grid(scene), scene.distance_m
+        focal_um = float(um_from_m(m_from_mm(self._image_distance_mm(distance_m))))
+        found: Floats = self._cache.illumination.get(
+            (grid, distance_m, scene.projection),
+            lambda: solid_angles_sr(grid, focal_um, scene.projection, is_flat=self.pupil_tilt == "flat"),
+        )
+        return found
 
     def _squared_tangents(self, scene: SceneLike) -> tuple[Floats, Floats]:
         """Return (x0/H)² of the scene columns and (y0/H)² of the scene rows."""

@@ -1,4 +1,4 @@
-"""Scene: spectral radiance of a plane in front of the lens."""
+"""Scene: spectral radiance of a plane in front of the lens, or by direction."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.calls import Limits, OwnCheck, check_declared
+from foveasim._core.calls import POSITIVE, Limits, OwnCheck, check_declared
 from foveasim._core.show import ViewMethod, view_method
 from foveasim._core.validation import (
     MAX_WAVELENGTH_NM,
@@ -35,10 +35,12 @@ from foveasim._io.encodings import FileEncoding, decode
 from foveasim._io.formats import as_file_error
 from foveasim._io.images import EncodedPicture, as_encoded, write_picture
 from foveasim._io.mapped_files import check_unchanged, value_range
+from foveasim._projections import ImageProjection
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.fields import from_file_rows
 from foveasim.scene._colorimetry import LUMINANCE_WEIGHTS
 from foveasim.scene._illuminants import Illuminant
+from foveasim.scene._panorama import CELLS, TURN, Mapping, Panorama
 from foveasim.scene._photometry import level_of_white, luminance_of
 from foveasim.scene.cubes import (
     IlluminantTable,
@@ -73,6 +75,8 @@ GREY_BAND_WIDTH_NM = 100.0
 MAX_ENCODED = 16.0
 #: Larger values are errors of units: 1e9 m is the distance and width of an astronomical scene.
 PITCH, DISTANCE = Limits(above=0.0, at_most=1e15), Limits(above=0.0, at_most=1e9)
+#: Distance of panoramas, m.
+FAR_M = 1e6
 #: Tolerance of a pitch that is given together with the field of view: rounding errors.
 PITCH_ROUNDING = 1e-9
 #: Spectral radiance above that of any source, W/(m² sr nm); that of the sun is about 2e4.
@@ -100,7 +104,8 @@ class Scene:
     """
     Spectral radiance of a plane at a given distance in front of the lens.
 
-    Usually created by :meth:`from_picture`, :meth:`from_cube`, :meth:`from_display`, :meth:`flat` or :meth:`point_sources`.
+    Usually created by :meth:`from_picture`, :meth:`from_panorama`, :meth:`from_cube`, :meth:`from_display`, :meth:`flat` or
+    :meth:`point_sources`.
 
     Parameters
     ----------
@@ -141,6 +146,12 @@ class Scene:
         With ``fit``, where the optical axis meets the sensor; :meth:`foveasim.Camera.fit_scene` sets it with the pitch.
     display : Display, optional
         Display that shows the picture, as the frames of a video with this scene as template: :meth:`from_display`.
+    projection : {"rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"}
+        Projection of the picture: ``"rectilinear"`` is a plane in front of the lens. In others, the pixel at the distance r
+        from the axis has the direction θ with ``r = distance ρ(θ)``, with the image height ρ of :class:`foveasim.Optics`.
+    panorama : Panorama, optional
+        Directions of the pixels of a picture that is not a plane, with ``fit="cover"``: see :meth:`from_panorama`. A camera
+        computes the image in its projection, with ``panorama=None``.
 
     Raises
     ------
@@ -183,6 +194,8 @@ class Scene:
     is_rgb: bool = field(default=False, kw_only=True)
     axis_um: tuple[float, float] | None = field(default=None, kw_only=True)
     display: Display | None = field(default=None, kw_only=True)
+    projection: ImageProjection = field(default="rectilinear", kw_only=True)
+    panorama: Panorama | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         check_declared(self)
@@ -237,6 +250,10 @@ class Scene:
             if self.fit is None:
                 raise ParameterError("axis_um", "requires 'fit'", self.axis_um, "µm")
             object.__setattr__(self, "axis_um", check_point("axis_um", self.axis_um))
+        if self.panorama is not None:
+            if self.fit != "cover":
+                raise ParameterError("panorama", "requires fit='cover'", self.fit)
+            self.panorama.check_shape(basis.shape[1:])
         if any(self.gaze_range_um) and self.fit != "cover":
             raise ParameterError("gaze_range_um", "requires fit='cover'", self.gaze_range_um, "µm")
 
@@ -299,6 +316,47 @@ class Scene:
         axis = None if axis_um is None else check_point("axis_um", axis_um)
         return self._with(pitch_um=PITCH.check("pitch_um", pitch_um), axis_um=axis)
 
+    def resampled(
+        self, basis: Images, pitch_um: float, axis_um: tuple[float, float] | None, projection: ImageProjection
+    ) -> Scene:
+        """Return a panorama as the picture of its image, with its pitch and its optical axis."""
+        return self._with(basis=basis, projection=projection, panorama=None).framed(pitch_um, axis_um)
+
+    def turned(
+        self, *, yaw_deg: float | None = None, pitch_deg: float | None = None, roll_deg: float | None = None
+    ) -> Scene:
+        """
+        Return a panorama with another orientation of the camera.
+
+        Parameters
+        ----------
+        yaw_deg, pitch_deg, roll_deg : float, optional, degrees
+            As for :meth:`from_panorama`; by default those of this scene.
+
+        Returns
+        -------
+        Scene
+            Shares the arrays of this scene.
+
+        Raises
+        ------
+        ParameterError
+            If the scene is a plane.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> scene = fs.Scene.from_panorama(np.ones((16, 32)), luminance_cd_m2=100.0)
+        >>> scene.turned(yaw_deg=90.0).panorama.yaw_deg
+        90.0
+        """
+        if self.panorama is None:
+            raise ParameterError("scene", "must be a panorama, which Scene.from_panorama creates, got a plane")
+        angles = {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg}
+        given: dict[str, Any] = {name: value for name, value in angles.items() if value is not None}
+        return self._with(panorama=replace(self.panorama, **given))
+
     def with_centre(self, centre_um: tuple[float, float]) -> Scene:
         """
         Return the scene at another position.
@@ -324,6 +382,11 @@ class Scene:
 
     def __repr__(self) -> str:
         n_basis, n_y, n_x = vars(self)["basis"].shape
+        if self.panorama is not None:
+            return (
+                f"Scene({self.panorama.mapping} panorama of {n_x} x {n_y} pixels, {n_basis} basis images, "
+                f"{self.wavelength_nm.size} wavelengths, from {printable(self.source)[:MAX_SOURCE]})"
+            )
         size = f", fit='{self.fit}'," if self.pitch_um is None else f" of {self.pitch_um:g} µm"
         return (
             f"Scene({n_x} x {n_y} pixels{size} at {self.distance_m:g} m, {n_basis} basis images, "
@@ -497,6 +560,118 @@ class Scene:
             is_picture=True,
             is_rgb=colours.shape[0] == len(RGB_NM),
         )
+
+    @classmethod
+    def from_panorama(
+        cls,
+        picture: OwnCheck[str | Path | ArrayLike],
+        *,
+        mapping: Mapping = "equirectangular",
+        yaw_deg: Annotated[float, TURN] = 0.0,
+        pitch_deg: Annotated[float, TURN] = 0.0,
+        roll_deg: Annotated[float, TURN] = 0.0,
+        cells: Annotated[int | Literal["auto"], CELLS] = "auto",
+        lens: OwnCheck[Any] = None,
+        pixel_um: Annotated[float | None, POSITIVE] = None,
+        gaze_range_um: tuple[float, float] = (0.0, 0.0),
+        distance_m: float = FAR_M,
+        peak_radiance_w_m2_sr_nm: float | None = None,
+        luminance_cd_m2: float | None = None,
+        illuminance_lux: float | None = None,
+        reflectance: float = 1.0,
+        wavelength_nm: Sequence[float] | None = None,
+        band_width_nm: float | Sequence[float] | None = None,
+        spectrum: Sequence[Sequence[float]] | Floats | None = None,
+        encoding: FileEncoding = "auto",
+        channels: Literal["rgb", "bgr"] = "rgb",
+    ) -> Scene:
+        """
+        Create a scene from a panorama: radiance by direction, for lenses with any field.
+
+        Parameters
+        ----------
+        picture : path, image of Pillow, or (n_y, n_x) or (n_y, n_x, n_channel) array
+            As for :meth:`from_picture`.
+        mapping : {"equirectangular", "cubemap", "fisheye"}
+            ``"equirectangular"``: 360° by 180°, the zenith in the top row, the direction straight ahead in the centre.
+            ``"cubemap"``: a horizontal cross of 4 x 3 square faces: left, front, right and back from left to right in the
+            middle row, top and bottom above and below the front. ``"fisheye"``: a photograph by a lens with a calibration; it
+            is dark outside the photograph, and its relative illumination is not corrected.
+        yaw_deg, pitch_deg, roll_deg : float, degrees
+            Orientation of the camera: it turns to the right, then upwards, then clockwise about its axis.
+        cells : "auto" or int
+            Number of cells along the longer side of the image that a camera computes. ``"auto"``: two per pixel of the panorama
+            on the axis, at least 64 and at most 2048.
+        lens : lens model of foveasim.distortion, optional
+            For a fisheye photograph, its lens; the origin is the centre of the photograph.
+        pixel_um : float, optional, µm
+            For a fisheye photograph, the pixel size in its calibration.
+        gaze_range_um : (x, y), µm
+            Range of gazes for which the image covers the layout: see the class.
+        distance_m : float, m
+            Distance of the scene, for the focus of the lens.
+        peak_radiance_w_m2_sr_nm, luminance_cd_m2, illuminance_lux, reflectance
+            As for :meth:`from_picture`.
+        wavelength_nm, band_width_nm, spectrum, encoding, channels
+            As for :meth:`from_picture`.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read.
+        ParameterError
+            As for :meth:`from_picture`, or if the picture does not have the shape of the mapping.
+
+        Notes
+        -----
+        A camera computes the image once per orientation: the mean radiance over the solid angle of each cell, from fractions
+        of pixels, so that small features are not lost, and the poles are not sampled at single points.
+
+        Examples
+        --------
+        An ideal fisheye lens with a field of 185 degrees:
+
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> sky = np.repeat([1.0, 0.2], 32)[:, np.newaxis] * np.ones(
+        ...     128
+        ... )  # bright above the horizon
+        >>> scene = fs.Scene.from_panorama(sky, luminance_cd_m2=1000.0, encoding="linear")
+        >>> lens = fs.distortion.Fisheye(projection="equidistant", focal_um=1000.0)
+        >>> camera = fs.Camera(
+        ...     optics=fs.Optics(focal_length_mm=1.0, f_number=2.8),
+        ...     sensor=fs.Sensor(fs.layout.grid(n_x=2, n_y=3, pitch_um=1000.0)),
+        ...     distortion=lens,
+        ... )
+        >>> rates = camera.photoelectrons_per_s(scene)
+        >>> camera.projection(scene), (rates / rates.max()).round(2).tolist()
+        ('equidistant', [0.2, 0.2, 0.71, 0.71, 1.0, 1.0])
+        """
+        panorama = Panorama(
+            mapping=mapping,
+            yaw_deg=yaw_deg,
+            pitch_deg=pitch_deg,
+            roll_deg=roll_deg,
+            cells=cells,
+            lens=lens,
+            pixel_um=pixel_um,
+        )
+        scene = cls.from_picture(
+            picture,
+            fit="cover",
+            gaze_range_um=gaze_range_um,
+            distance_m=distance_m,
+            peak_radiance_w_m2_sr_nm=peak_radiance_w_m2_sr_nm,
+            luminance_cd_m2=luminance_cd_m2,
+            illuminance_lux=illuminance_lux,
+            reflectance=reflectance,
+            wavelength_nm=wavelength_nm,
+            band_width_nm=band_width_nm,
+            spectrum=spectrum,
+            encoding=encoding,
+            channels=channels,
+        )
+        return replace(scene, panorama=panorama)
 
     @classmethod
     def from_cube(
@@ -973,7 +1148,15 @@ def _example_on_display(directory: Path) -> dict[str, Any]:
     return {"picture": _example_picture(directory)["picture"], "display": "lcd", "distance_m": 1.0}
 
 
+def _example_panorama(directory: Path) -> dict[str, Any]:
+    """Write a panorama that is bright at the upper left and the lower right."""
+    path = directory / "panorama.png"
+    write_picture(path, np.array([[255, 0, 0, 0], [0, 0, 255, 255]], np.uint8))
+    return {"picture": str(path), "peak_radiance_w_m2_sr_nm": 0.02, "yaw_deg": 20.0, **_BAND}
+
+
 SCENES.register("picture", Scene.from_picture, example=_example_picture, expected=("#..", "#..", "##."))
+SCENES.register("panorama", Scene.from_panorama, example=_example_panorama, expected=("#...", "..##"))
 _FLAT = {**_GEOMETRY, **_BAND, "shape": (4, 6), "radiance_w_m2_sr_nm": 0.02}
 SCENES.register("flat", Scene.flat, example=_FLAT, expected=("##", "##"))
 SCENES.register(

@@ -392,6 +392,9 @@ CALLS = {
     "Scene.from_display": lambda o: fs.Scene.from_display(
         o.photos / "cats" / "0.png", "oled", distance_m=0.5, subpixels=True
     ).on_display(o.photos / "cats" / "1.png"),
+    "Scene.from_panorama": lambda o: o.camera.projection(
+        fs.Scene.from_panorama(np.ones((8, 16)), luminance_cd_m2=10.0).turned(yaw_deg=20.0)
+    ),
     "Camera.video": lambda o: list(o.camera.video([o.scene] * 2, exposure_s=0.01, seed=0)),
     "Camera.noise_budget": lambda o: o.camera.noise_budget(o.scene, exposure_s=0.01).plot(),
     "Camera.compare_with": lambda o: o.twins,
