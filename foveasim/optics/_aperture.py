@@ -39,6 +39,8 @@ PUPIL_POINTS = 1535
 MAX_CACHED_MEANS = 4
 #: Points across the aperture at which the wavefront slope is evaluated.
 SLOPE_POINTS = 193
+#: Half the distance of the points of a central difference, in radii.
+SLOPE_STEP = 1e-4
 #: Frequencies of the quadrature in radians per radius: the first beyond the geometric blur, the factor between attempts, and
 #: the limit beyond which a pupil is sampled.
 FIRST_RADIANS, RADIANS_STEP, MAX_RADIANS = 8.0, 1.5, 500.0
@@ -295,6 +297,14 @@ class Aperture:
         for part in self.wavefronts:
             total_um = total_um + part.wavefront_um(x, y, wavelength_nm, field_um)
         return np.asarray(total_um)
+
+    def ray_slopes(self, points: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:
+        """Return the slope of the wavefront along x and y, µm per radius, at points (n, 2)."""
+        x, y = points.T
+        step = SLOPE_STEP
+        path_um = partial(self.path_um, wavelength_nm=wavelength_nm, field_um=field_um)
+        along_x, along_y = path_um(x + step, y) - path_um(x - step, y), path_um(x, y + step) - path_um(x, y - step)
+        return np.stack((along_x, along_y), axis=1) / (2.0 * step)
 
     def blur_lambda_n(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
         """Return the largest geometric ray displacement in units of λN: twice the slope in waves."""

@@ -33,6 +33,8 @@ SUMS_TOGETHER = 16
 MAX_CACHED_APERTURES = 4
 #: Largest number of cached geometries of scenes.
 MAX_CACHED_VIEWS = 16
+#: Largest number of cached scenes with depth.
+MAX_CACHED_LAYERS = 2
 #: Memory limit of the tables of all wavelengths, in numbers (128 MiB); beyond it, their step increases.
 MAX_TABLE_SIZE = 1 << 24
 #: Memory limit of the tables cached per lens, in complex numbers (512 MiB in single precision).
@@ -244,6 +246,8 @@ class TableCache:
         self.modes = BoundedCache(MAX_CACHED_APERTURES)
         self.illumination = BoundedCache(MAX_CACHED_APERTURES)
         self.views = BoundedCache(MAX_CACHED_VIEWS)
+        #: Layers of scenes with depth, and lenses that are focused for them, each with its own cache.
+        self.layers, self.focused = BoundedCache(MAX_CACHED_LAYERS), BoundedCache(MAX_CACHED_LAYERS)
 
     def __reduce__(self) -> tuple[type[TableCache], tuple[()]]:
         return TableCache, ()
