@@ -204,6 +204,11 @@ class Aperture:
         """Whether the OTF is that of a clear circle in focus."""
         return not self.pupils and not self.wavefronts and self.defocus_um == 0.0
 
+    @property
+    def is_defocused_circle(self) -> bool:
+        """Whether the OTF is that of a clear circle, in focus or not."""
+        return not self.pupils and not self.wavefronts
+
     def illumination(self, field_um: Floats) -> None:
         """Return None: the relative illumination is that of the thin lens."""
 

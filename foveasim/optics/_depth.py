@@ -167,7 +167,6 @@ class LayerLight:
         )
 
 
-
 #: Function of (light, layer, is_cover) that returns the rows of the maps of all outputs, without relative illumination.
 MapsOfLayer = Callable[[LayerLight, Layer, bool], Iterator[MapRows]]
 

@@ -566,9 +566,12 @@ class Optics(PointImages):
         ParameterError
             When the scene is not a Scene or is too near, the pupil is empty, or the aberrations exceed the largest blur.
         """
-        grid = self.grid(scene)
+        grid, depths_m = self.grid(scene), _depth_range_m(scene)
+        is_deep = depths_m is not None and depths_m[0] < depths_m[1]
         for aperture in self._extreme_apertures(scene):
-            if aperture.is_clear_circle:
+            if aperture.is_clear_circle or (
+                is_deep and isinstance(aperture, Aperture) and aperture.is_defocused_circle
+            ):
                 continue
             for wave_nm in scene.wavelength_nm:
                 aperture.transmittance(float(wave_nm))
@@ -734,9 +737,7 @@ class Optics(PointImages):
             return imaging.maps(tables_at((0.0, 0.0)))
         return isoplanatic_maps(imaging, self.n_patches, tables_at)
 
-    def _maps_with_depth(
-        self, scene: SceneLike, weights: Floats, grid: Grid, n_threads: int
-    ) -> Iterator[MapRows]:
+    def _maps_with_depth(self, scene: SceneLike, weights: Floats, grid: Grid, n_threads: int) -> Iterator[MapRows]:
         """Yield maps of a scene with depth; all maps are in memory together."""
         from foveasim.optics._depth import composed_maps, mean_spectrum
         from foveasim.optics._imaging import rows_of
@@ -780,7 +781,9 @@ class Optics(PointImages):
                 return aperture.ray_slopes(points, wave_nm, centre) * (2.0 * n_number / grid.pitch_x_um)
 
             def transmittance(points: Floats, wave_nm: float = wave_nm) -> Floats:
-                return np.prod([np.abs(p(*points.T, wave_nm)) ** 2 for p in self._pupils()] or [np.ones(len(points))], 0)
+                x, y = points.T
+                every = [np.square(np.abs(pupil(x, y, wave_nm))) for pupil in self._pupils()]
+                return np.asarray(np.prod([np.ones(x.size), *every], axis=0))
 
             fine = fine_pixels(layers, self._n_fine)
             image = np.kron(pixels, np.ones((self._n_fine, self._n_fine)))[np.newaxis]
@@ -811,7 +814,8 @@ class Optics(PointImages):
         from foveasim.optics._depth import Layers
 
         depth_m, max_layers = depth_of(scene), getattr(scene, "depth_layers", None)
-        assert depth_m is not None and self.focus_distance_m is not None
+        assert depth_m is not None
+        assert self.focus_distance_m is not None
         focus_m = self.focus_distance_m
         self._check_distance("depth_m", float(depth_m.min()))
         view = self._view(scene)
@@ -830,10 +834,7 @@ class Optics(PointImages):
         aperture = self._aperture(scene.distance_m)
         transmittance = np.array([aperture.transmittance(float(w)) for w in scene.wavelength_nm])
         irradiance_w_m2 = (
-            spectrum_w_m2_sr_nm
-            * scene.band_width_nm
-            * transmittance
-            * self.irradiance_per_radiance(scene.distance_m)
+            spectrum_w_m2_sr_nm * scene.band_width_nm * transmittance * self.irradiance_per_radiance(scene.distance_m)
         )
         pixel_um = grid.pitch_x_um * self._n_fine
         return irradiance_w_m2 * (_pitch_um(scene) * self._view(scene).magnification / pixel_um) ** 2
@@ -896,6 +897,11 @@ class Optics(PointImages):
         object_m = scene.distance_m if object_m is None else object_m
         aperture = self._aperture(object_m)
         is_clear_circle = aperture.is_clear_circle
+        defocus_um = 0.0
+        if layer_part is not None and isinstance(aperture, Aperture) and aperture.is_defocused_circle:
+            is_clear_circle, defocus_um = True, aperture.defocus_um
+        # Of the lens, whatever the cells are.
+        blur_um = 4.0 * defocus_um * lambda_n_um / um_from_nm(scene.wavelength_nm)
         pixels = Grid.centred(
             (scene.basis.shape[1], scene.basis.shape[2]), grid.pitch_x_um * self._n_fine, grid.centre_um
         )
@@ -955,8 +961,14 @@ class Optics(PointImages):
         )
 
         def tables_at(field_um: tuple[float, float]) -> Tables:
-            if is_clear_circle:
+            if is_clear_circle and defocus_um == 0.0:
                 return RadialTables(1.0 / lambda_n_um, self._real_type())
+            if is_clear_circle:
+                found: RadialTables = self._cache.radial.get(
+                    (scene.wavelength_nm.tobytes(), lambda_n_um.tobytes(), object_m),
+                    lambda: RadialTables(1.0 / lambda_n_um, self._real_type(), blur_um / (4.0 * lambda_n_um)),
+                )
+                return found
 
             points_um, combinations = [field_um], ONE_POINT
             if modes is not None:

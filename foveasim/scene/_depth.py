@@ -61,7 +61,9 @@ def read_depth(
         raise ParameterError("depth_scale", "must not be given together with 'depth_format'", depth_scale)
     if (depth_format == "middlebury") != (calibration is not None):
         raise ParameterError(
-            "calibration", "must be the file calib.txt of depth_format='middlebury', and is of no use otherwise", calibration
+            "calibration",
+            "must be the file calib.txt of depth_format='middlebury', and is of no use otherwise",
+            calibration,
         )
     if not isinstance(depth, str | os.PathLike):
         values = as_numbers("depth_m", depth, keep_type=True)
@@ -71,7 +73,7 @@ def read_depth(
     if depth_scale is None and depth_format is None:
         raise FileError(
             path,
-            "does not state the unit of its distances; pass depth_scale, in m per value (1 for m, 0.001 for mm), or depth_format",
+            "does not state the unit of its distances; pass depth_scale, in m per value (0.001 for mm), or depth_format",
         )
     if is_exr and depth_format is not None:
         raise ParameterError("depth_format", "must be None for EXR: pass depth_scale, in m per value", depth_format)
@@ -149,7 +151,9 @@ def _calibration(path: Path) -> tuple[float, float, float]:
             raise FileError(path, f"must have a number after {name}=, got {number:.40}") from None
     absent = [name for name in ("cam0", "doffs", "baseline") if name not in found]
     if absent:
-        raise FileError(path, f"must be a calibration of Middlebury 2014 with cam0, doffs and baseline, but lacks {absent[0]}")
+        raise FileError(
+            path, f"must be a calibration of Middlebury 2014 with cam0, doffs and baseline, but lacks {absent[0]}"
+        )
     return found["cam0"], found["doffs"], found["baseline"]
 
 

@@ -560,19 +560,19 @@ class Scene:
             background at infinity. Files: the channel Z of EXR, 16-bit PNG or TIFF, PFM, or numpy; their unit is
             ``depth_scale`` or ``depth_format``.
         distance_m : float, m
-            Distance of the plane in which ``pitch_um`` holds, and which is in focus unless the lens has a focus distance. A pixel
-            is a direction, that of its chief ray, so that the scale of the image does not depend on the depth.
+            Distance of the plane in which ``pitch_um`` holds, and which is in focus unless the lens has a focus distance. A
+            pixel is a direction, that of its chief ray, so that the scale of the image does not depend on the depth.
         depth_scale : float, optional, m
             Distance of the value 1 in ``depth_m``, such as 0.001 for millimetres; 1 for arrays by default.
         depth_format : {"mm", "nyu", "nyu_raw", "tum", "middlebury"}, optional
-            Convention of the values instead of a scale: millimetres in 16 bits; the same as the depth of NYU Depth v2 is usually
-            distributed (``"nyu"``), or its raw values d, ``351.3 / (1092.5 - d)`` m; 5000 per metre (TUM); disparities d of
-            Middlebury 2014, ``baseline f / (d + doffs)``.
+            Convention of the values instead of a scale: millimetres in integers, as in pictures of the depth of NYU Depth v2
+            (``"nyu"``); raw values d of that set, ``351.3 / (1092.5 - d)`` m; 5000 per metre (TUM); disparities d of Middlebury
+            2014, ``baseline f / (d + doffs)``.
         calibration : path, optional
             File ``calib.txt`` of the disparities of Middlebury.
         missing : {"raise", "far", "nearest"}
-            What pixels with the value 0 or NaN, and unknown disparities, mean: an error, infinity, or the distance of the nearest
-            pixel that has one.
+            What pixels with the value 0 or NaN, and unknown disparities, mean: an error, infinity, or the distance of the
+            nearest pixel that has one.
         depth_layers : int, optional
             Largest number of layers. By default the blur radii of adjacent layers differ by one pixel or λN/2.
         pitch_um, fit, gaze_range_um, field_of_view_deg, peak_radiance_w_m2_sr_nm, luminance_cd_m2, illuminance_lux, reflectance
@@ -589,9 +589,9 @@ class Scene:
 
         Notes
         -----
-        The lens blurs a point at the distance H over a disc of the radius ``a D |1/H - 1/H_focus|``, with the pupil radius a and
-        the image distance D, in addition to diffraction and aberrations. Near objects cover far ones:
-        :mod:`foveasim.optics`, section on scenes with depth in the guide.
+        The lens blurs a point at the distance H over a disc of the radius ``a D |1/H - 1/H_focus|``, with the pupil radius a
+        and the image distance D, in addition to diffraction and aberrations. Near objects cover far ones; what they hide is
+        the far surface at their rim, continued.
 
         Examples
         --------

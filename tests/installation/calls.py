@@ -392,6 +392,11 @@ CALLS = {
     "Scene.from_display": lambda o: fs.Scene.from_display(
         o.photos / "cats" / "0.png", "oled", distance_m=0.5, subpixels=True
     ).on_display(o.photos / "cats" / "1.png"),
+    "Scene.from_rgbd": lambda o: o.optics.power_map(
+        fs.Scene.from_rgbd(
+            np.ones((8, 8)), np.full((8, 8), 1.0), pitch_um=100.0, distance_m=0.5, peak_radiance_w_m2_sr_nm=0.05
+        )
+    ),
     "Camera.video": lambda o: list(o.camera.video([o.scene] * 2, exposure_s=0.01, seed=0)),
     "Camera.noise_budget": lambda o: o.camera.noise_budget(o.scene, exposure_s=0.01).plot(),
     "Camera.compare_with": lambda o: o.twins,
