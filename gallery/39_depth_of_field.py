@@ -6,8 +6,8 @@ New here: ``fs.Scene.from_rgbd``, ``Optics(focus_distance_m=...)`` with depth,
 
 Expect: a ball at 0.4 m, a post at 0.8 m and a wall at 3 m, on a floor, in focus in
 turn. Behind the blurred edge of the ball, the wall is visible. Layers agree with rays
-through points of the pupil within 1.5 % of white (root mean square), of which a part is the
-diffraction that rays lack.
+through points of the pupil within 1.5 % of white (root mean square), of which a part is
+the diffraction that rays lack.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ def picture_and_depth() -> tuple[np.ndarray, np.ndarray]:
 
 
 def lens(focus_m: float) -> fs.Optics:
+    """Return a lens with a focus distance."""
     return fs.Optics(focal_length_mm=6.0, f_number=1.8, focus_distance_m=focus_m)
 
 
@@ -103,6 +104,7 @@ def figure_of_errors(out: Path) -> float:
 
 
 def main(out: Path) -> None:
+    """Write the figures."""
     figure_of_focus(out)
     print(f"error of layers: {100.0 * figure_of_errors(out):.2g} % of white (rms)")
 

@@ -24,7 +24,7 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats
 from foveasim.errors import ParameterError, type_name
 from foveasim.optics._quadrature import Nodes, PupilEdges, joined, plane_waves, pupil_nodes
-from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider
+from foveasim.optics.pupils import Annulus, Blades, Half, Pupil, PupilImage, Slit, Spider
 from foveasim.units import um_from_nm
 
 #: Samples across an unaberrated aperture; the OTF is then accurate to 4e-4.
@@ -219,7 +219,7 @@ class Aperture:
     @cached_property
     def is_achromatic(self) -> bool:
         """Whether all pupils are known to be independent of the wavelength."""
-        plain = (Annulus, Blades, Slit, Spider)
+        plain = (Annulus, Blades, Half, Slit, Spider)
         return all(isinstance(p, plain) or (isinstance(p, PupilImage) and p.wavefront_um is None) for p in self.pupils)
 
     @cached_property

@@ -1,5 +1,5 @@
 """
-Power maps of scenes with depth: layers of equal defocus, of which near ones cover far ones.
+Power maps of scenes with depth: layers, of which near ones cover far ones.
 
 The pixels of a picture with depth are directions. Pixels with almost equal reciprocal distances form a layer l, with cover α_l
 and radiance S_l. Each layer is imaged through the same pupil with its own defocus, h_l. From the nearest layer to the farthest,
@@ -182,9 +182,9 @@ def composed_maps(
     scene: SceneLike, layers: Layers, maps_of: MapsOfLayer, cover: Floats, shape: tuple[int, int], real: Any
 ) -> NDArray[Any]:
     """
-    Return the maps (n_output, n_y, n_x) of layers that cover each other, without relative illumination.
+    Return the maps (n_output, n_y, n_x) of layers that cover each other.
 
-    The spectra of one layer are in memory at a time. ``cover`` (n_output,): outputs for the mean spectrum of the scene.
+    Relative illumination is not applied. The spectra of one layer are in memory at a time. ``cover`` (n_output,): outputs for the mean spectrum of the scene.
     """
     total, left = np.zeros((cover.size, *shape), real), np.ones((cover.size, *shape), real)
     white = mean_spectrum(scene)[np.newaxis]
@@ -227,9 +227,9 @@ def reference_map(
     padding: str,
 ) -> NDArray[Any]:
     """
-    Return an image (n_y, n_x) as the mean over points of the pupil, at each of which near layers hide far ones.
+    Return an image (n_y, n_x) as the mean over points of the pupil.
 
-    ``images``: pixels (1, n_y, n_x). ``shifts_cells``: function of a layer and points (n, 2) of the pupil that returns the
+    At each, near layers hide far ones. ``images``: pixels (1, n_y, n_x). ``shifts_cells``: function of a layer and points (n, 2) of the pupil that returns the
     displacements (n, 2) of its image along x and y. ``transmittance``: power at the points.
     """
     from scipy.ndimage import shift

@@ -28,7 +28,7 @@ from foveasim.optics.aberrations import LateralColour, Seidel, Zernike
 from foveasim.optics.otf import MAX_ALIASES, ONE_POINT, PlaneTables, RadialTables, TableCache, Tables
 from foveasim.optics.psfs._field import FieldPSFs
 from foveasim.optics.psfs._grid import PSFGrid
-from foveasim.optics.pupils import Pupil
+from foveasim.optics.pupils import Half, Pupil
 from foveasim.units import m_from_mm, m_from_um, um_from_m, um_from_nm
 
 if TYPE_CHECKING:
@@ -187,6 +187,9 @@ class Optics(PointImages):
         distance. It determines the chief ray angles at the sites of a sensor with ``pixel_optics`` (see :meth:`incidence`), and
         the relative illumination: the integral of the radiance over the cone at each point, instead of the law of the fourth
         power of the cosine of the field angle. For pupils with a central obscuration it is that of the clear circle.
+    pupil_part : {"full", "left", "right"}
+        Half of the pupil behind the photodiodes of one side of dual pixels. The energies of both halves add up to that of the
+        full pupil, but not their PSFs, since the halves diffract separately: use the full pupil for the sum.
     chief_ray : ChiefRayTable, optional
         Chief ray angles at image heights, instead of an exit pupil; beyond the last height, those there.
 
@@ -248,6 +251,7 @@ class Optics(PointImages):
     padding_cells: Annotated[int | None, Limits(at_least=0, at_most=2**20)] = None
     precision: Literal["single", "double"] = "single"
     exit_pupil_mm: Annotated[float | None, Usual(1.0, 200.0)] = None
+    pupil_part: Literal["full", "left", "right"] = "full"
     chief_ray: ChiefRayTable | None = None
     _cache: TableCache = field(default_factory=TableCache, init=False, repr=False, compare=False)
 
@@ -267,8 +271,8 @@ class Optics(PointImages):
                 "pupil", "must be a pupil of foveasim.optics, or a callable T(x, y, wavelength_nm)", self.pupil
             )
         if self.psfs is not None:
-            for name in ("pupil", "zernike", "seidel"):
-                if getattr(self, name) is not None:
+            for name in ("pupil", "zernike", "seidel", "pupil_part"):
+                if getattr(self, name) not in (None, "full"):
                     raise ParameterError(name, "must not be given with 'psfs', which contain it", getattr(self, name))
             if self.relative_illumination is not None and self.psfs.relative_illumination is not None:
                 raise ParameterError(
@@ -1090,9 +1094,10 @@ class Optics(PointImages):
     # -- parts ----------------------------------------------------------------------------------------------------
 
     def _pupils(self) -> tuple[Pupil, ...]:
+        half = () if self.pupil_part == "full" else (Half(self.pupil_part),)
         if self.pupil is None:
-            return ()
-        return tuple(self.pupil) if isinstance(self.pupil, Sequence) else (self.pupil,)
+            return half
+        return (*(self.pupil if isinstance(self.pupil, Sequence) else (self.pupil,)), *half)
 
     def aperture(self, scene: SceneLike) -> PSFModel:
         """Return the aperture, or the sampled PSFs, for the distance of a scene."""

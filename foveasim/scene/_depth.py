@@ -53,9 +53,9 @@ def read_depth(
     missing: Missing,
 ) -> Floats:
     """
-    Return distances (n_y, n_x), m, bottom row first, from an array or a file, top row first.
+    Return distances (n_y, n_x), m, bottom row first.
 
-    Raises ParameterError or FileError.
+    ``depth``: array or file, top row first.     Raises ParameterError or FileError.
     """
     if depth_scale is not None and depth_format is not None:
         raise ParameterError("depth_scale", "must not be given together with 'depth_format'", depth_scale)
@@ -113,7 +113,7 @@ def _read(path: Path) -> tuple[NDArray[Any], bool]:
 def _in_m(
     values: NDArray[Any], scale: float | None, depth_format: DepthFormat | None, calibration: str | Path | None
 ) -> Floats:
-    """Return stored values in m: 0 where a disparity or a code means that there is no distance."""
+    """Return stored values in m: 0 where a code means that there is no distance."""
     stored = values.astype(np.float64)
     if scale is not None:
         return stored * check_number("depth_scale", scale, above=0.0)

@@ -392,7 +392,7 @@ CALLS = {
     "Scene.from_display": lambda o: fs.Scene.from_display(
         o.photos / "cats" / "0.png", "oled", distance_m=0.5, subpixels=True
     ).on_display(o.photos / "cats" / "1.png"),
-    "Scene.from_rgbd": lambda o: o.optics.power_map(
+    "Scene.from_rgbd": lambda o: fs.Optics(focal_length_mm=8.0, f_number=2.8).power_map(
         fs.Scene.from_rgbd(
             np.ones((8, 8)), np.full((8, 8), 1.0), pitch_um=100.0, distance_m=0.5, peak_radiance_w_m2_sr_nm=0.05
         )

@@ -178,3 +178,43 @@ def test_lateral_colour_and_field_aberrations_compose():
             (found,) = optics.weighted_maps(scene, weights, grid=grid)
 
             np.testing.assert_allclose(found, found.mean(), rtol=1e-6)
+
+
+def test_halves_of_pupil_add_up_in_energy():
+    picture, radius = random_scene(0)
+    scene = scene_of(picture, depth_of_blur_m(radius))
+
+    left, right, full = (lens(pupil_part=part).power_map(scene).data.sum() for part in ("left", "right", "full"))
+
+    assert left + right == pytest.approx(full, rel=1e-3)
+    plane = fs.Scene.from_picture(picture, distance_m=FOCUS_M, pitch_um=scene.pitch_um, **BAND)
+    parts = [
+        lens(pupil_part=part, padding="periodic").power_map(plane).data.sum() for part in ("left", "right", "full")
+    ]
+    assert parts[0] == pytest.approx(parts[1], rel=1e-12)
+    assert parts[0] + parts[1] == pytest.approx(parts[2], rel=1e-12)
+
+
+@pytest.mark.parametrize(("part", "sign"), [("left", -1.0), ("right", 1.0)])
+def test_centroids_of_half_pupils_are_displaced(part, sign):
+    """By 4 r / 3π, the centroid of a half disc: towards its own side in front of the focus."""
+    radius_cells = 6.0
+    picture = np.zeros((64, 64))
+    picture[32, 32] = 1.0
+    scene = scene_of(picture, np.full((64, 64), depth_of_blur_m(radius_cells)))
+
+    data = lens(pupil_part=part, padding="periodic").power_map(scene).data[0]
+
+    x = np.arange(64) - 32.0
+    near = np.abs(x) < 20.0
+    centroid = (data.sum(axis=0) * x)[near].sum() / data.sum(axis=0)[near].sum()
+    assert centroid == pytest.approx(sign * 4.0 * radius_cells / (3.0 * np.pi), rel=0.03)
+
+
+def test_sum_of_halves_has_half_the_peak():
+    """In focus the halves diffract more: the peak of each is a quarter of the full one."""
+    optics = {part: lens(f_number=8.0, pupil_part=part) for part in ("left", "right", "full")}
+    # PSFs are normalised to their power, of which each half has half.
+    peaks = {part: float(each.psf(550.0, n_points=1).psf_per_um2[0, 0]) for part, each in optics.items()}
+
+    assert 0.5 * (peaks["left"] + peaks["right"]) == pytest.approx(0.5 * peaks["full"], rel=1e-6)
