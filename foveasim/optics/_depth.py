@@ -184,7 +184,8 @@ def composed_maps(
     """
     Return the maps (n_output, n_y, n_x) of layers that cover each other.
 
-    Relative illumination is not applied. The spectra of one layer are in memory at a time. ``cover`` (n_output,): outputs for the mean spectrum of the scene.
+    Relative illumination is not applied. The spectra of one layer are in memory at a time. ``cover`` (n_output,): outputs for
+    the mean spectrum of the scene.
     """
     total, left = np.zeros((cover.size, *shape), real), np.ones((cover.size, *shape), real)
     white = mean_spectrum(scene)[np.newaxis]
@@ -229,8 +230,9 @@ def reference_map(
     """
     Return an image (n_y, n_x) as the mean over points of the pupil.
 
-    At each, near layers hide far ones. ``images``: pixels (1, n_y, n_x). ``shifts_cells``: function of a layer and points (n, 2) of the pupil that returns the
-    displacements (n, 2) of its image along x and y. ``transmittance``: power at the points.
+    At each, near layers hide far ones. ``images``: pixels (1, n_y, n_x). ``shifts_cells``: function of a layer and points
+    (n, 2) of the pupil that returns the displacements (n, 2) of its image along x and y. ``transmittance``: power at the
+    points.
     """
     from scipy.ndimage import shift
 
