@@ -105,6 +105,7 @@ def figure_of_errors(out: Path) -> float:
 
 def main(out: Path) -> None:
     """Write the figures."""
+    out.mkdir(parents=True, exist_ok=True)
     figure_of_focus(out)
     print(f"error of layers: {100.0 * figure_of_errors(out):.2g} % of white (rms)")
 
