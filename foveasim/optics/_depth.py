@@ -41,7 +41,7 @@ STEP_CELLS = 1.5
 #: Smallest sum of shares: a division by less would amplify rounding errors.
 MIN_SHARE = 1e-3
 #: Rows of maps that are composed together.
-ROWS_TOGETHER = 256
+ROWS_TOGETHER = 64
 #: Points of the pupil of the reference: rings of equal area, and points on each.
 REFERENCE_RINGS, REFERENCE_POINTS = 12, 24
 
@@ -97,10 +97,10 @@ class Layers:
             found = is_visible[np.newaxis].astype(real)
             found.reshape(1, -1)[:, behind] = 1.0
             return found
-        found = np.empty(images.shape, images.dtype)
+        found = np.zeros(images.shape, images.dtype)
         for image, out in zip(images, found, strict=True):
             pixels = in_memory(image)
-            np.multiply(pixels, is_visible, out=out)
+            np.copyto(out, pixels, where=is_visible)
             out.ravel()[behind] = pixels.ravel()[self.rim.ravel()[behind]]
         return found
 
@@ -201,11 +201,10 @@ def composed_maps(
                 share = rows_of_cover(first, last) * real(1.0 / cover[c])
                 part, room = rows_of_light(first, last), left[c, first:last]
                 # A cover within the room keeps its light as it is, rounding errors included, which conserves energy.
-                is_too_large = share > room
-                part[is_too_large] *= room[is_too_large] / share[is_too_large]
-                np.minimum(share, room, out=share)
+                filled = np.minimum(share, room)
+                part *= np.divide(filled, share, out=np.ones_like(share), where=share > room)
                 total[c, first:last] += part
-                room -= share
+                room -= filled
     total /= np.maximum(1.0 - left, real(MIN_SHARE))
     return total
 

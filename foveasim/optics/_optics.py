@@ -850,7 +850,9 @@ class Optics(PointImages):
         if illumination is None:
             x2, y2 = self._squared_tangents(scene, self._n_fine)
             for row, row_y2 in enumerate(y2):
-                maps[:, row] *= (1.0 + x2 + row_y2) ** (-0.5 * self._falloff_power)
+                tangent2 = 1.0 + x2 + row_y2
+                falloff = tangent2 * tangent2 if self._falloff_power == 4 else tangent2**1.5
+                maps[:, row] /= falloff.astype(maps.dtype)
         for part in illumination or []:
             maps *= part.at_pixels().astype(maps.dtype)
 
