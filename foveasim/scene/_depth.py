@@ -34,7 +34,7 @@ DepthFormat: TypeAlias = Literal["mm", "nyu", "nyu_raw", "tum", "middlebury"]
 Missing: TypeAlias = Literal["raise", "far", "nearest"]
 #: Metres per stored value.
 SCALES_M: dict[str, float] = {"mm": 1e-3, "nyu": 1e-3, "tum": 1.0 / 5000.0}
-#: Raw values d of NYU Depth v2 are disparities of the Kinect: 351.3 / (1092.5 - d) m, at most 10 m.
+#: Raw values d of NYU Depth v2, with swapped bytes, are disparities of the Kinect: 351.3 / (1092.5 - d) m, at most 10 m.
 NYU_NUMERATOR_M, NYU_OFFSET, NYU_FARTHEST_M = 351.3, 1092.5, 10.0
 #: Numbers of a calibration of Middlebury: ``cam0=[f 0 cx; 0 f cy; 0 0 1]``, ``doffs=...`` in pixels, ``baseline=...`` in mm.
 CALIBRATION = re.compile(r"^\s*(cam0|doffs|baseline)\s*=\s*\[?\s*([-+0-9.eE]+)", re.MULTILINE)
