@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.calls import POSITIVE, Limits, OwnCheck, check_declared
 from foveasim._core.show import ViewMethod, view_method
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import (
     MAX_WAVELENGTH_NM,
     Floats,
@@ -39,6 +40,7 @@ from foveasim._projections import ImageProjection
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.fields import from_file_rows
 from foveasim.scene._colorimetry import LUMINANCE_WEIGHTS
+from foveasim.scene._depth import DepthFormat, Missing, check_depth, read_depth
 from foveasim.scene._illuminants import Illuminant
 from foveasim.scene._panorama import CELLS, TURN, Mapping, Panorama
 from foveasim.scene._photometry import level_of_white, luminance_of
@@ -82,6 +84,10 @@ PITCH_ROUNDING = 1e-9
 #: Spectral radiance above that of any source, W/(m² sr nm); that of the sun is about 2e4.
 MAX_RADIANCE = 1e24
 RADIANCE = Limits(at_least=0.0, at_most=MAX_RADIANCE)
+#: Distance of the value 1 in files of distances, m.
+DEPTH_SCALE = Limits(above=0.0, at_most=1e9)
+#: Layers of a scene with depth.
+LAYERS = Limits(at_least=1, at_most=256)
 #: Characters of the source in the representation.
 MAX_SOURCE = 100
 
@@ -152,6 +158,11 @@ class Scene:
     panorama : Panorama, optional
         Directions of the pixels of a picture that is not a plane, with ``fit="cover"``: see :meth:`from_panorama`. A camera
         computes the image in its projection, with ``panorama=None``.
+    depth_m : (n_y, n_x) float64, optional, m
+        Distance of each pixel along the optical axis, bottom row first, instead of ``distance_m`` for all; infinity is allowed.
+        See :meth:`from_rgbd`.
+    depth_layers : int, optional
+        Largest number of layers of a scene with depth.
 
     Raises
     ------
@@ -196,6 +207,8 @@ class Scene:
     display: Display | None = field(default=None, kw_only=True)
     projection: ImageProjection = field(default="rectilinear", kw_only=True)
     panorama: Panorama | None = field(default=None, kw_only=True)
+    depth_m: Floats | None = field(default=None, kw_only=True)
+    depth_layers: Annotated[int | None, LAYERS] = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         check_declared(self)
@@ -241,6 +254,10 @@ class Scene:
             object.__setattr__(self, "illuminant", frozen_array(illuminant))
         if self.is_rgb and basis.shape[0] != len(RGB_NM):
             raise ParameterError("is_rgb", f"requires three basis images, got {basis.shape[0]}")
+        if self.depth_m is not None:
+            object.__setattr__(self, "depth_m", frozen_array(check_depth(self.depth_m, basis.shape[1:])))
+        elif self.depth_layers is not None:
+            raise ParameterError("depth_layers", "requires 'depth_m'", self.depth_layers)
         object.__setattr__(self, "pitch_um", self._checked_pitch_um())
         object.__setattr__(self, "centre_um", check_point("centre_um", self.centre_um))
         object.__setattr__(self, "gaze_range_um", check_point("gaze_range_um", self.gaze_range_um, at_least=0.0))
@@ -287,6 +304,11 @@ class Scene:
         """
         weights = luminance_of(self.spectrum_w_m2_sr_nm, self.wavelength_nm, self.band_width_nm)
         return np.asarray(np.tensordot(weights, self.basis, axes=1))
+
+    @cached_property
+    def depth_range_m(self) -> tuple[float, float] | None:
+        """Smallest and largest distance of the pixels, m; None without depth."""
+        return None if self.depth_m is None else (float(self.depth_m.min()), float(self.depth_m.max()))
 
     def with_pitch(self, pitch_um: float) -> Scene:
         """
@@ -388,8 +410,10 @@ class Scene:
                 f"{self.wavelength_nm.size} wavelengths, from {printable(self.source)[:MAX_SOURCE]})"
             )
         size = f", fit='{self.fit}'," if self.pitch_um is None else f" of {self.pitch_um:g} µm"
+        depths_m = self.depth_range_m
+        depth = "" if depths_m is None else f", depth {depths_m[0]:g} to {depths_m[1]:g} m"
         return (
-            f"Scene({n_x} x {n_y} pixels{size} at {self.distance_m:g} m, {n_basis} basis images, "
+            f"Scene({n_x} x {n_y} pixels{size} at {self.distance_m:g} m{depth}, {n_basis} basis images, "
             f"{self.wavelength_nm.size} wavelengths, from {printable(self.source)[:MAX_SOURCE]})"
         )
 
@@ -672,6 +696,114 @@ class Scene:
             channels=channels,
         )
         return replace(scene, panorama=panorama)
+
+    @classmethod
+    def from_rgbd(
+        cls,
+        picture: OwnCheck[str | Path | ArrayLike],
+        depth_m: OwnCheck[str | Path | ArrayLike],
+        *,
+        distance_m: float,
+        depth_scale: Annotated[float | None, DEPTH_SCALE] = None,
+        depth_format: DepthFormat | None = None,
+        calibration: str | Path | None = None,
+        missing: Missing = "raise",
+        depth_layers: Annotated[int | None, LAYERS] = None,
+        pitch_um: float | None = None,
+        fit: Fit | None = None,
+        gaze_range_um: tuple[float, float] = (0.0, 0.0),
+        field_of_view_deg: float | None = None,
+        peak_radiance_w_m2_sr_nm: float | None = None,
+        luminance_cd_m2: float | None = None,
+        illuminance_lux: float | None = None,
+        reflectance: float = 1.0,
+        wavelength_nm: Sequence[float] | None = None,
+        band_width_nm: float | Sequence[float] | None = None,
+        spectrum: Sequence[Sequence[float]] | Floats | None = None,
+        encoding: FileEncoding = "auto",
+        channels: Literal["rgb", "bgr"] = "rgb",
+    ) -> Scene:
+        """
+        Create a scene from a photograph and the distance of each of its pixels.
+
+        Parameters
+        ----------
+        picture : path, image of Pillow, or array
+            Photograph that is sharp at all distances, as for :meth:`from_picture`.
+        depth_m : (n_y, n_x) array, or path
+            Distance of each pixel along the optical axis, in m, top row first, of the size of the picture. Infinity is the
+            background at infinity. Files: the channel Z of EXR, 16-bit PNG or TIFF, PFM, or numpy; their unit is
+            ``depth_scale`` or ``depth_format``.
+        distance_m : float, m
+            Distance of the plane in which ``pitch_um`` holds, and which is in focus unless the lens has a focus distance. A
+            pixel is a direction, that of its chief ray, so that the scale of the image does not depend on the depth.
+        depth_scale : float, optional, m
+            Distance of the value 1 in ``depth_m``, such as 0.001 for millimetres; 1 for arrays by default.
+        depth_format : {"mm", "nyu", "nyu_raw", "tum", "middlebury"}, optional
+            Convention of the values instead of a scale: millimetres in integers, as in pictures of the depth of NYU Depth v2
+            (``"nyu"``); raw values d of that set, ``351.3 / (1092.5 - d)`` m; 5000 per metre (TUM); disparities d of Middlebury
+            2014, ``baseline f / (d + doffs)``.
+        calibration : path, optional
+            File ``calib.txt`` of the disparities of Middlebury.
+        missing : {"raise", "far", "nearest"}
+            What pixels with the value 0 or NaN, and unknown disparities, mean: an error, infinity, or the distance of the
+            nearest pixel that has one.
+        depth_layers : int, optional
+            Largest number of layers. By default the blur radii of adjacent layers differ by one pixel or λN/2.
+        pitch_um, fit, gaze_range_um, field_of_view_deg, peak_radiance_w_m2_sr_nm, luminance_cd_m2, illuminance_lux, reflectance
+            As for :meth:`from_picture`.
+        wavelength_nm, band_width_nm, spectrum, encoding, channels
+            As for :meth:`from_picture`.
+
+        Raises
+        ------
+        FileError
+            If a file cannot be read, or does not state the unit of its distances.
+        ParameterError
+            If shapes differ, a distance is negative or missing, or an argument is out of range, as for :meth:`from_picture`.
+
+        Notes
+        -----
+        The lens blurs a point at the distance H over a disc of the radius ``a D |1/H - 1/H_focus|``, with the pupil radius a
+        and the image distance D, in addition to diffraction and aberrations. Near objects cover far ones; what they hide is
+        the far surface at their rim, continued.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> depth_m = np.where(np.arange(64) < 32, 0.5, 2.0) * np.ones((48, 1))
+        >>> scene = fs.Scene.from_rgbd(
+        ...     np.ones((48, 64)),
+        ...     depth_m,
+        ...     distance_m=2.0,
+        ...     pitch_um=500.0,
+        ...     illuminance_lux=500.0,
+        ... )
+        >>> scene.depth_range_m
+        (0.5, 2.0)
+        """
+        distances_m = read_depth(
+            depth_m, depth_scale=depth_scale, depth_format=depth_format, calibration=calibration, missing=missing
+        )
+        plane = cls.from_picture(
+            picture,
+            pitch_um=pitch_um,
+            fit=fit,
+            gaze_range_um=gaze_range_um,
+            field_of_view_deg=field_of_view_deg,
+            distance_m=distance_m,
+            peak_radiance_w_m2_sr_nm=peak_radiance_w_m2_sr_nm,
+            luminance_cd_m2=luminance_cd_m2,
+            illuminance_lux=illuminance_lux,
+            reflectance=reflectance,
+            wavelength_nm=wavelength_nm,
+            band_width_nm=band_width_nm,
+            spectrum=spectrum,
+            encoding=encoding,
+            channels=channels,
+        )
+        return replace(plane, depth_m=distances_m, depth_layers=depth_layers)
 
     @classmethod
     def from_cube(
@@ -1135,6 +1267,13 @@ def _example_picture(directory: Path) -> dict[str, Any]:
     return {"picture": str(path), "peak_radiance_w_m2_sr_nm": 0.02, **_BAND, **_GEOMETRY}
 
 
+def _example_rgbd(directory: Path) -> dict[str, Any]:
+    """Write a picture, and its distances in millimetres."""
+    path = directory / "depth.png"
+    write_picture(path, np.array([[1000, 1000, 900], [1000, 1000, 900], [1000, 1000, 900]], np.uint16))
+    return {**_example_picture(directory), "depth_m": str(path), "depth_format": "mm"}
+
+
 def _example_cube(directory: Path) -> dict[str, Any]:
     """Write an ENVI cube of two bands."""
     np.array([[[3, 0, 0], [3, 3, 0]]] * 2, "<f4").tofile(directory / "cube.img")
@@ -1157,6 +1296,7 @@ def _example_panorama(directory: Path) -> dict[str, Any]:
 
 SCENES.register("picture", Scene.from_picture, example=_example_picture, expected=("#..", "#..", "##."))
 SCENES.register("panorama", Scene.from_panorama, example=_example_panorama, expected=("#...", "..##"))
+SCENES.register("rgbd", Scene.from_rgbd, example=_example_rgbd, expected=("#..", "#..", "##."))
 _FLAT = {**_GEOMETRY, **_BAND, "shape": (4, 6), "radiance_w_m2_sr_nm": 0.02}
 SCENES.register("flat", Scene.flat, example=_FLAT, expected=("##", "##"))
 SCENES.register(

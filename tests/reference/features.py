@@ -45,6 +45,9 @@ POINTS = {"wavelength_nm": [550.0], "band_width_nm": 60.0}
 SCENE_ARGUMENTS: dict[str, dict[str, Any]] = {
     "picture": GEOMETRY
     | {"picture": "picture.png", "peak_radiance_w_m2_sr_nm": 0.08, "wavelength_nm": [620.0, 550.0, 450.0]},
+    "rgbd": GEOMETRY
+    | {"picture": "picture.png", "peak_radiance_w_m2_sr_nm": 0.08, "wavelength_nm": [620.0, 550.0, 450.0]}
+    | {"depth_m": "depth.png", "depth_scale": 1e-6},
     "flat": CHART | GREY,
     "point_sources": CHART | POINTS | {"pixels": [[30, 40], [60, 61], [80, 20]], "intensity_w_sr_nm": 1e-4},
     "display": {
@@ -314,6 +317,8 @@ def write_files(directory: Path):
     """Write the files that the settings refer to."""
     rng = np.random.default_rng(0)
     write_picture(directory / "picture.png", rng.integers(0, 256, (*SHAPE, 3), np.uint8))
+    near = np.hypot(*np.mgrid[-1 : 1 : 1j * SHAPE[0], -1 : 1 : 1j * SHAPE[1]]) < 0.4
+    write_picture(directory / "depth.png", np.where(near, 300, int(1e6 * DISTANCE_M)).astype(np.uint16))
     y, x = np.mgrid[-1:1:64j, -1:1:64j]
     write_picture(directory / "pupil.png", np.uint8(255 * (np.hypot(x, y) < 0.9) * (y > -0.4)))
     write_picture(directory / "importance.png", np.uint8(255 * np.exp(-3.0 * np.hypot(x, y))))
