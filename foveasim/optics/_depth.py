@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats, Images, Ints
 from foveasim._io.mapped_files import in_memory
+from foveasim._projections import ImageProjection
 from foveasim.optics._imaging import MapRows
 
 if TYPE_CHECKING:
@@ -152,6 +153,7 @@ class LayerLight:
     pitch_um: float | None
     centre_um: tuple[float, float]
     distance_m: float
+    projection: ImageProjection
 
     @classmethod
     def of(cls, scene: SceneLike, images: Images, spectrum_w_m2_sr_nm: Floats) -> LayerLight:
@@ -164,6 +166,7 @@ class LayerLight:
             scene.pitch_um,
             scene.centre_um,
             scene.distance_m,
+            scene.projection,
         )
 
 
