@@ -44,6 +44,8 @@ DEAD_RESPONSE, HOT_PROBABILITY = 0.5, 0.01
 MAX_NONLINEARITY_ERROR = 0.1
 #: Rounds of the fit, with what differs between pixels from the round before.
 ROUNDS = 3
+#: Chi-square per degree of freedom from which a fit starts again, and noise and shifts of the black level there, in codes.
+UNEXPLAINED, OTHER_SIGMAS, OTHER_SHIFTS = 3.0, (0.2, 0.4), (-0.3, 0.0, 0.3)
 #: Fraction of the full well above which the first fit leaves out levels.
 CLOSE_FRACTION = 0.85
 #: Smallest variance of a pixel in the dark, over the mean one.
@@ -280,6 +282,8 @@ class _Fit:
             )  # fmt: skip
 
         found = fit(names)
+        if before is None and found.chi_square > UNEXPLAINED:
+            found = min((found, *map(fit, self._other_starts(names))), key=lambda each: each.chi_square)
         bend = "nonlinearity_fraction"
         if bend in names and found.error(bend) > MAX_NONLINEARITY_ERROR:
             self.estimates[bend] = Uncertain(
@@ -287,6 +291,24 @@ class _Fit:
             )
             found = fit({name: value for name, value in self.start_names(found).items() if name != bend})
         return found
+
+    def _other_starts(self, names: Mapping[str, float]) -> list[dict[str, float]]:
+        """
+        Return first values with other noise and black levels.
+
+        Where noise is small against the codes, the moments of dark frames are periodic in the black level, and the likelihood
+        has several maxima.
+        """
+        width_dn = float(self.adc.width_of_code_dn(self.levels.mean_dn.min()))
+        return [
+            {
+                **names,
+                "read_noise_e2": (sigma * width_dn / names["gain_dn_per_e"]) ** 2,
+                "black_level_dn": names["black_level_dn"] + shift * width_dn,
+            }
+            for sigma in OTHER_SIGMAS
+            for shift in OTHER_SHIFTS
+        ]
 
     def _dnl(self) -> tuple[float, float]:
         """Return the variance by DNL, which all levels have, and its standard error, DN²."""
