@@ -270,8 +270,6 @@ def axes():
 
 #: Edits that cut sites along other outlines, and leave slivers of some.
 CUTTING_EDITS = ("clip", "cut_along", "cut_out", "overlay")
-#: Lens models whose images of panoramas are not rectilinear.
-AS_PANORAMIC = tuple(name for name in LENSES if name != "brown_conrady")
 #: Features that only some generators have: sites with readout lines.
 WITHOUT_LINES = ("penrose", "sunflower", "voronoi", "voronoi_of")
 
@@ -282,12 +280,9 @@ def is_possible(row):
     needs_lines = features.get("fixed") == "column_fpn" or features.get("adc") == "dnl"
     if needs_lines and features.get("layout") in WITHOUT_LINES:
         return False
-    # Points that radiate uniformly are those of a plane; images of panoramas by these lenses are not rectilinear.
-    if (
-        features.get("scene") == "panorama"
-        and features.get("optics") == "isotropic"
-        and features.get("distortion") in AS_PANORAMIC
-    ):
+    # Points that radiate uniformly are those of a plane; images of panoramas through lens models are not rectilinear.
+    is_isotropic = features.get("scene") == "panorama" and features.get("optics") == "isotropic"
+    if is_isotropic and features.get("distortion") not in (None, "none"):
         return False
     has_slivers = features.get("edit") in CUTTING_EDITS and features.get("layout") not in (None, "grid")
     # Capacitances in proportion to the area of slivers are below the limit, and couple to those of their neighbours too strongly.
