@@ -29,6 +29,7 @@ import scipy.fft
 import shapely
 from angular import bench_angular
 from dense import EXPOSURE_S, bench_dense
+from depth import bench_depth
 from exploring import bench_exploring
 from field_modes import bench_field_modes
 from frames import bench_frames
@@ -448,6 +449,7 @@ def benchmarks(*, is_quick: bool) -> list[tuple[Callable[..., object], tuple[obj
         (bench_dense, (side,)),
         (bench_angular, (shape, side)),
         (bench_field_modes, (side,)),
+        (bench_depth, (side,)),
         (bench_kernels, (side,)),
         (bench_sensor, (n_side,)),
         (bench_small, ()),

@@ -8,7 +8,7 @@ two orders.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
 
 import numpy as np
@@ -32,6 +32,7 @@ from foveasim._core.validation import (
     unmasked,
     wavelengths_nm,
 )
+from foveasim._projections import ImageProjection
 from foveasim.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -193,6 +194,10 @@ class SceneLike(Protocol):
     def distance_m(self) -> float:
         """Distance between the scene and the pupil."""
 
+    @property
+    def projection(self) -> ImageProjection:
+        """Projection of the picture: rectilinear for one of a plane in front of the lens."""
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -298,6 +303,8 @@ class PowerMap:
         Grid of the cells.
     wavelength_nm : (n_band,) float64, nm
         Wavelength of each band.
+    projection : {"rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"}
+        Projection of the image in the plane of the map, from which a camera with a lens model derives directions.
 
     Raises
     ------
@@ -316,6 +323,7 @@ class PowerMap:
     data: Images
     grid: Grid
     wavelength_nm: Floats
+    projection: ImageProjection = field(default="rectilinear", kw_only=True)
 
     def __post_init__(self) -> None:
         data = np.asarray(unmasked("data", self.data))

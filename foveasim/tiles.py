@@ -166,6 +166,7 @@ def _tiles(
     camera: Camera, source: Scene | PowerMap, exposure_s: float, streams: Streams, tile_sites: int, tiles: range
 ) -> Iterator[Capture]:
     layout, light = camera.layout, camera.light_at_gaze(source)
+    lens = camera.lens_for(light)
     if isinstance(light, Scene):
         warn_of_focal_length(camera.optics, camera.distortion, light)
     images = _images(camera, light)
@@ -179,13 +180,13 @@ def _tiles(
             sites = layout[first:last]
             footprints = find_footprints(camera, sites, sensor.pixel_optics, light, camera.position_um)
             part = placed(sites, footprints, camera.position_um)
-            bounds_um = outline_bounds_um(part, camera.distortion)
+            bounds_um = outline_bounds_um(part, lens)
             strips = [_rows_under(image.grid, bounds_um) for image in images]
             integrators = [
                 Integrator(
                     part,
                     _strip(image.grid, *rows),
-                    distortion=camera.distortion,
+                    distortion=lens,
                     order=camera.order(light),
                     compiled=False,
                     n_threads=camera.n_threads,
@@ -197,8 +198,8 @@ def _tiles(
             coverages.append(Covered.by(smallest))
         else:
             sites = placed(sites, None, camera.position_um)
-            own_um = outline_bounds_um(sites, camera.distortion)
-            coverages.append(Covered.of(sites, own_um, smallest_grid, camera.distortion, camera.n_threads))
+            own_um = outline_bounds_um(sites, lens)
+            coverages.append(Covered.of(sites, own_um, smallest_grid, lens, camera.n_threads))
         maps = _maps(sensor, light, images, strips, clock)
         rate_e_per_s = integrate_maps(sensor, light, maps, integrators, clock, footprints)
         # Arrays per site are those of all sites, as in a stored capture.

@@ -30,7 +30,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 #: Six floors, each of which imports from those below, and the layers of each, from the bottom: imports from lower layers only.
 #: Modules of a package that are not on its floor have an entry of their own.
 FLOORS = {
-    "ground": [{"errors", "_version"}, {"_core"}, {"units"}, {"_io"}, {"fields", "incidence"}, {"maps"}],
+    "ground": [{"errors", "_version"}, {"_core"}, {"units", "_projections"}, {"_io"}, {"fields", "incidence"}, {"maps"}],
     "physics": [
         {
             "distortion", "integrate", "optics", "scene", "sensor", "layout._kernels", "layout.lattice", "layout.model",
@@ -55,7 +55,7 @@ HEAVY = {
 }  # fmt: skip
 #: Names of dimensionless numbers, or of numbers in the unit of other arguments.
 DIMENSIONLESS = {
-    "light", "photons", "default", "errors",
+    "light", "photons", "default", "directions", "errors", "depth_scale", "waves",
     "combinations", "displaced", "relative_illumination", "field_tolerance", "goal", "singular_values", "a", "above", "alpha", "amplitude", "area_ratio", "at_least", "at_most", "beta", "blanking", "circle_tolerance", "coefficients", "colour_matrix", "companding_table", "contrast", "contrast_off", "contrast_on", "count", "custom", "data_range", "delta_e", "delta_e_raw", "deviation", "dilation", "dpi", "esf", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "half_step", "high", "hot_sigmas", "illuminant", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
     "confidence", "curves", "difference", "light_factor", "real", "regions", "simulated", "limit", "limits", "log_strength", "low", "magnification", "matrix", "median", "min_coverage", "misfit", "missing", "mtf", "mtf_sigma", "mu", "max_aspect_ratio", "obscuration", "offset",
     "contrast_noise", "log_contrast", "threshold", "thresholds_off", "thresholds_on", "intervals",
@@ -68,10 +68,10 @@ INTERNAL = {
     "log_mean", "parts", "nodes", "slopes", "variance_slope", "along_y", "at_points", "fields", "profiles", "at", "axes", "before", "blur_cells", "blur_lambda_n", "bound", "bounds", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "homography", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
     "n_across", "n_source_cells", "moments", "new_radius", "node", "norm", "off_diagonal", "one", "other", "per_step", "pixel", "plane", "points", "quantiles", "r2", "radius", "right", "row", "rows", "s_x", "s_y", "scale", "screen", "side", "sigma", "slope", "spread", "start", "tables_at",
     "tangent2_x", "tangent2_y", "threshold", "to_step", "u", "upper", "v", "x", "x2", "xy", "y", "y2", "sampling", "step", "t", "weigh", "window",
-    "error", "freedom", "covariance", "edges", "lines", "log_odds_error", "log_step_error", "names", "noise", "of_blocks", "of_pixels", "own_covariance", "probability", "residuals", "share", "square", "vector",
+    "across", "direction", "pitch", "u0", "u1", "v0", "v1", "error", "freedom", "covariance", "edges", "lines", "log_odds_error", "log_step_error", "names", "noise", "of_blocks", "of_pixels", "own_covariance", "probability", "residuals", "share", "square", "vector",
     "neutral", "primaries", "transfer",
     "bounds_db", "difference_db", "illumination", "spectra", "srgb", "white_xyz", "xyz", "centre", "centres", "circles", "column_x", "compute", "discs", "maps", "opening", "photodiode", "position", "half", "lines_x", "lines_y", "ordered", "phase", "radians", "radians_x", "rho", "row_y", "segments", "shift", "tangents",
-    "background", "changes",
+    "background", "changes", "cover", "shifts_cells", "transmittance",
 }  # fmt: skip
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")
 

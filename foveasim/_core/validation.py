@@ -66,6 +66,7 @@ UNIT_SUFFIXES = {
     "_w_m2_um2": "(W/m²)·µm²",
     "_w_m2": "W/m²",
     "_w_sr": "W/sr",
+    "_sr": "sr",
     "_j_s": "J s",
     "_per_mm": "per mm",
     "_per_s": "per s",

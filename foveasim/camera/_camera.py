@@ -20,19 +20,21 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.show import load, view_method
 from foveasim._core.threads import cached_property, thread_count
 from foveasim._core.validation import Floats, check_per_site, check_point, finite_array
+from foveasim._projections import ImageProjection
 from foveasim.camera._clock import Clock
 from foveasim.camera._colour import colour_correction
 from foveasim.camera._exposure import ExposureTime
 from foveasim.camera._footprints import FootprintCache, find_incidence, placed
 from foveasim.camera._frames import Frame, ImageCache, Position, check_frames
-from foveasim.camera._framing import axis_of, common_bounds_um, fit_scene
+from foveasim.camera._framing import axis_of, common_bounds_um, fit_panorama, fit_scene
 from foveasim.camera._rates import expected_rates, footprints_at
 from foveasim.camera._steps import SensorFrame, capture_for_time, check_exposure, seconds_of, white_dn
 from foveasim.camera._video import rates_of_frames, video
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
+from foveasim.distortion._projected import ProjectedLens, max_angle_rad, nearest_projection
 from foveasim.errors import ParameterError, type_name
-from foveasim.fields import Grid, PowerMap
+from foveasim.fields import Grid, PointMap, PowerMap
 from foveasim.incidence import Incidence
 from foveasim.integrate import Integrator, outline_bounds_um
 from foveasim.layout.model import Layout
@@ -81,7 +83,8 @@ class Camera:
     axis : {"image", "sensor"}
         What the optical axis is fixed to when the gaze moves. ``"image"``: the sensor moves behind a fixed lens; relative
         illumination, aberrations and distortion stay with the image, which is computed once for all gazes of a video.
-        ``"sensor"``: the camera turns towards the gaze; they stay with the sensor, and the image is computed for each gaze.
+        ``"sensor"``: the camera turns towards the gaze; they stay with the sensor, and the image is computed for each gaze. In
+        a panorama, the gaze is the direction of its point.
     n_threads : int, optional
         Number of threads, by default one per core. Results are bit-identical for any number.
 
@@ -139,12 +142,13 @@ class Camera:
         self._gaze_um = check_point("gaze_um", gaze_um)
         self._axis: GazeAxis = axis
         self._n_threads = thread_count(n_threads)
-        #: By grid, order, position, whether the overlaps are stored, and footprints.
-        self._integrators: dict[tuple[Grid, int, Position, bool, Footprints | None], Integrator] = {}
+        #: By grid, order, position, whether the overlaps are stored, footprints, and projection.
+        self._integrators: dict[tuple[Grid, int, Position, bool, Footprints | None, ImageProjection], Integrator] = {}
         self._footprints = FootprintCache()
-        self._bounds_um: list[tuple[float, float, float, float]] = []
-        #: The most recent scene with ``fit``, and the framed scene.
-        self._framed: tuple[Scene, Scene] | None = None
+        self._bounds_um: dict[ImageProjection, tuple[float, float, float, float]] = {}
+        self._lenses: dict[ImageProjection, ProjectedLens] = {}
+        #: The most recent scene with ``fit``, the gaze of a camera that turns, and the framed scene.
+        self._framed: tuple[Scene, Position, Scene] | None = None
         #: Causes of warnings that are not repeated.
         self._warned: set[str] = set()
 
@@ -152,7 +156,8 @@ class Camera:
         return vars(self) | {
             "_integrators": {},
             "_footprints": FootprintCache(),
-            "_bounds_um": [],
+            "_bounds_um": {},
+            "_lenses": {},
             "_framed": None,
         }  # without caches
 
@@ -276,23 +281,87 @@ class Camera:
         >>> [round(camera.image_grid(framed).bounds_um[2], 6) for camera in cameras]
         [20.0, 20.0]
         """
+        chosen = self._optics.projection
+        is_plane = scene.panorama is None and scene.projection == "rectilinear"
+        if is_plane and self._distortion is None and chosen not in ("auto", "rectilinear"):
+            raise ParameterError(
+                "distortion",
+                f"must be given for a photograph of a plane in the {chosen} projection; pass "
+                f"foveasim.distortion.Fisheye(projection='{chosen}', focal_um=...)",
+            )
         if scene.pitch_um is not None:
             return scene
-        cameras = [self, *others]
-        if len(cameras) > 1:
-            return fit_scene(scene, self._optics, self._distortion, common_bounds_um(cameras, str(scene.fit)))
+        return self._frame([self, *others], scene, (0.0, 0.0))
+
+    def _frame(self, cameras: Sequence[Camera], scene: Scene, gaze_um: Position) -> Scene:
+        """Return a scene with its pitch; ``gaze_um`` turns the camera in a panorama."""
         framed = self._framed
-        if framed is None or framed[0] is not scene:
-            bounds_um = common_bounds_um(cameras, str(scene.fit))
-            self._framed = framed = scene, fit_scene(scene, self._optics, self._distortion, bounds_um)
-        return framed[1]
+        if len(cameras) == 1 and framed is not None and framed[0] is scene and framed[1] == gaze_um:
+            return framed[2]
+        projection = self.projection(scene)
+        bounds_um = common_bounds_um(cameras, str(scene.fit), projection)
+        if scene.panorama is None:
+            found = fit_scene(scene, self._optics, self._distortion, bounds_um)
+        else:
+            found = fit_panorama(scene, self._optics, self._distortion, bounds_um, projection, gaze_um, self._n_threads)
+        if len(cameras) == 1:
+            self._framed = scene, gaze_um, found
+        return found
 
     @property
     def layout_bounds_um(self) -> Floats:
         """Bounds of the undistorted outlines, (4,) µm; NaN without any in the image circle."""
-        if not self._bounds_um:
-            self._bounds_um.append(outline_bounds_um(self._layout, self._distortion))
-        return np.array(self._bounds_um[0])
+        return self.bounds_in_um("rectilinear")
+
+    def bounds_in_um(self, projection: ImageProjection) -> Floats:
+        """Return the bounds of the outlines in an image of a projection, (4,) µm; NaN without any."""
+        if projection not in self._bounds_um:
+            self._bounds_um[projection] = outline_bounds_um(self._layout, self._lens_in(projection))
+        return np.array(self._bounds_um[projection])
+
+    def projection(self, light: Scene | PowerMap) -> ImageProjection:
+        """
+        Return the projection of the image of a scene, or of a power map.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+
+        Returns
+        -------
+        {"rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"}
+            That of a power map or of a picture. For a panorama that of ``Optics(projection=...)``; if it is ``"auto"``, the
+            one nearest to the lens model within the bounds of the layout, rectilinear without a model.
+        """
+        if isinstance(light, PowerMap) or light.panorama is None:
+            return light.projection
+        chosen = self._optics.projection
+        if chosen != "auto":
+            return chosen
+        return "rectilinear" if self._distortion is None else self._nearest_projection
+
+    @cached_property
+    def _nearest_projection(self) -> ImageProjection:
+        """Projection nearest to the lens model."""
+        assert self._distortion is not None
+        bounds_um = np.array(outline_bounds_um(self._layout))
+        return nearest_projection(self._distortion, max_angle_rad(self._distortion, bounds_um))
+
+    def lens_for(self, light: Scene | PowerMap) -> PointMap | None:
+        """
+        Return the lens whose ideal positions are those of the image of a scene or power map.
+
+        Returns
+        -------
+        object with ``distort`` and ``undistort``, or None
+            :attr:`distortion`, unless the :meth:`projection` of the image is not rectilinear.
+        """
+        return self._lens_in(self.projection(light))
+
+    def _lens_in(self, projection: ImageProjection) -> PointMap | None:
+        if self._distortion is None or projection == "rectilinear":
+            return self._distortion
+        return self._lenses.setdefault(projection, ProjectedLens(self._distortion, projection))
 
     def sensor_frame(self, scene: Scene) -> SensorFrame:
         """Return the optical axis and the scales of the image of a scene."""
@@ -324,7 +393,8 @@ class Camera:
         Returns
         -------
         Scene or PowerMap
-            For ``axis="sensor"`` a scene whose centre is displaced against the gaze; otherwise only the pitch is set.
+            For ``axis="sensor"`` a scene whose centre is displaced against the gaze, or a panorama seen in its direction;
+            otherwise only the pitch is set.
 
         Raises
         ------
@@ -340,7 +410,15 @@ class Camera:
                 "must be 'image' for a power map: its relative illumination and aberrations are fixed",
                 self._axis,
             )
+        if light.panorama is not None:
+            return self._frame([self], light, (float(gaze[0]), float(gaze[1])))
         scene = self.fit_scene(light)
+        if scene.projection != "rectilinear":
+            raise ParameterError(
+                "axis",
+                f"must be 'image' for a picture in the {scene.projection} projection; use Scene.from_panorama",
+                self._axis,
+            )
         per_um = self.sensor_frame(scene).scale * self._optics.magnification(scene.distance_m)
         x_um, y_um = (np.array(scene.centre_um) - gaze / per_um).tolist()
         return scene.with_centre((x_um, y_um))
@@ -386,7 +464,7 @@ class Camera:
         """
         scene = self._scene_at_gaze(scene)
         power_map = self._optics.resolve_oversample(scene).power_map(scene, n_threads=self._n_threads)
-        return PowerMap(power_map.data, self.sensor_frame(scene).image(power_map.grid), power_map.wavelength_nm)
+        return replace(power_map, grid=self.sensor_frame(scene).image(power_map.grid))
 
     def integrator(
         self,
@@ -397,6 +475,7 @@ class Camera:
         position_um: Position | None = None,
         compiled: bool = True,
         footprints: Footprints | None = None,
+        projection: ImageProjection = "rectilinear",
     ) -> Integrator:
         """
         Return the sensor's layout compiled for a grid.
@@ -415,6 +494,8 @@ class Camera:
         footprints : Footprints, optional
             Light that the sites collect: :meth:`footprints`. Its outlines, in the frame of the sensor, replace those of the
             layout.
+        projection : str
+            Projection of the image: :meth:`projection`.
 
         Returns
         -------
@@ -428,13 +509,14 @@ class Camera:
             position_um,
             compiled,
             None if footprints is None or footprints.outlines is None else footprints,
+            projection,
         )
         integrator = self._integrators.get(key)
         if integrator is None:
             integrator = Integrator(
                 placed(self._layout, footprints, position_um),
                 grid,
-                distortion=self._distortion,
+                distortion=self._lens_in(projection),
                 order=order,
                 compiled=compiled,
                 n_threads=self._n_threads,
@@ -471,7 +553,7 @@ class Camera:
             n_threads=self._n_threads if n_threads is None else n_threads,
         )
         if other._layout is self._layout:
-            other._bounds_um, other._footprints = self._bounds_um, self._footprints
+            other._bounds_um, other._lenses, other._footprints = self._bounds_um, self._lenses, self._footprints
             if other._n_threads == self._n_threads:
                 other._integrators = self._integrators
         return other

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -9,13 +10,16 @@ import numpy as np
 
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.validation import Floats
+from foveasim._projections import LAWS, ImageProjection
 from foveasim.camera._frames import Position
 from foveasim.camera._steps import SensorFrame
 from foveasim.camera._warnings import format_point, size_um
 from foveasim.distortion import Lens
+from foveasim.distortion._projected import directions_of
 from foveasim.errors import ParameterError
 from foveasim.optics import Optics
 from foveasim.scene import Scene
+from foveasim.units import um_from_m
 
 if TYPE_CHECKING:
     from foveasim.camera._camera import Camera
@@ -24,6 +28,8 @@ if TYPE_CHECKING:
 CENTRE_ROUNDING = 1e-9
 #: Margin of a picture that covers undistorted outlines: their edges are curves of limited accuracy.
 COVER_MARGIN = 1e-5
+#: Cells of the image of a panorama beyond the outlines of the photosites.
+MARGIN_CELLS = 4
 
 
 def axis_of(bounds_um: Floats) -> Position:
@@ -47,9 +53,9 @@ def different_part(one: Camera, other: Camera) -> str:
     return ""
 
 
-def common_bounds_um(cameras: Sequence[Camera], fit: str) -> Floats:
+def common_bounds_um(cameras: Sequence[Camera], fit: str, projection: ImageProjection = "rectilinear") -> Floats:
     """
-    Return the bounds of the undistorted outlines of all cameras, (4,) µm.
+    Return the bounds of the undistorted outlines of all cameras in an image, (4,) µm.
 
     Raises ParameterError when lenses differ, or when no camera has photosites in the image circle.
     """
@@ -57,7 +63,7 @@ def common_bounds_um(cameras: Sequence[Camera], fit: str) -> Floats:
     for camera in others:
         if part := different_part(first, camera):
             raise ParameterError("others", f"must be cameras with the same {part}")
-    bounds_um = np.array([camera.layout_bounds_um for camera in cameras])
+    bounds_um = np.array([camera.bounds_in_um(projection) for camera in cameras])
     known_um = bounds_um[~np.isnan(bounds_um).any(axis=1)]
     if not known_um.size:
         required = "photosites in the image circle" if any(c.layout.n_sites for c in cameras) else "photosites"
@@ -94,3 +100,49 @@ def fit_scene(scene: Scene, optics: Optics, lens: Lens | None, bounds_um: Floats
                 "'width', or move the layout",
             )
     return scene.framed(float(scale) * unit_um, frame.axis_um)
+
+
+def fit_panorama(
+    scene: Scene,
+    optics: Optics,
+    lens: Lens | None,
+    bounds_um: Floats,
+    projection: ImageProjection,
+    gaze_um: Position,
+    n_threads: int,
+) -> Scene:
+    """
+    Return the image of a panorama in a projection, as a scene of its cells.
+
+    ``bounds_um``: bounds of the field, (4,), in the image; its cells extend a few cells beyond. ``gaze_um``: the point of the
+    sensor towards which the camera turns.
+    """
+    panorama = scene.panorama
+    assert panorama is not None
+    law, frame = LAWS[projection], SensorFrame.of(lens, axis_of(bounds_um))
+    axis_um, distance_um = np.array(frame.axis_um), float(um_from_m(scene.distance_m))
+    focal_um = optics.magnification(scene.distance_m) * distance_um
+    reach_um = np.maximum(axis_um - bounds_um[:2], bounds_um[2:] - axis_um) + np.array(scene.gaze_range_um)
+    # In focal lengths, along the axes of the optics. Images of other colours may be smaller.
+    reach = reach_um / frame.scale / focal_um
+    if optics.lateral_colour is not None:
+        reach = reach / min(float(optics.lateral_colour.at(scene.wavelength_nm).min()), 1.0)
+    reach = np.minimum(reach, law.max_height)
+    if gaze_um != (0.0, 0.0):
+        panorama = panorama.towards(_gaze_direction(lens, projection, axis_um, focal_um, gaze_um))
+    n_along = panorama.n_cells(scene.basis.shape[1:], 2.0 * float(reach.max()))
+    pitch = 2.0 * float(reach.max()) / n_along
+    n_x, n_y = (2 * (math.ceil(0.5 * each) + MARGIN_CELLS) for each in 2.0 * reach / pitch - CENTRE_ROUNDING)
+    cells = panorama.cell_means(scene.basis, projection, (n_y, n_x), pitch, n_threads)
+    return scene.resampled(cells, pitch * distance_um, frame.axis_um, projection)
+
+
+def _gaze_direction(
+    lens: Lens | None, projection: ImageProjection, axis_um: Floats, focal_um: float, gaze_um: Position
+) -> Floats:
+    """Return the direction (3,) of a gaze from the axis."""
+    at_um = np.array([gaze_um])
+    found = LAWS[projection].directions(at_um / focal_um) if lens is None else directions_of(lens, axis_um + at_um)
+    if np.isnan(found).any():
+        raise ParameterError("gaze_um", "must be within the field of the lens", gaze_um, "µm")
+    return np.asarray(found[0])

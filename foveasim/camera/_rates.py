@@ -79,15 +79,16 @@ def expected_rates(
                 # Most gazes of a video occur once, and so do the images of a camera that turns.
                 compiled=moving_um is None or gaze_um == camera.gaze_um,
                 footprints=footprints,
+                projection=camera.projection(light),
             )
             for grid in grids
         ]
         smallest = min(integrators, key=lambda integrator: integrator.grid.cell_area_um2)
         covered = Covered.by(smallest)
         if footprints is not None and footprints.outlines is not None:
-            bounds_um = (camera.layout_bounds_um + np.tile(position_um, 2)).tolist()
+            bounds_um = (camera.bounds_in_um(camera.projection(light)) + np.tile(position_um, 2)).tolist()
             moved = placed(layout, None, position_um)
-            covered = Covered.of(moved, bounds_um, smallest.grid, camera.distortion, camera.n_threads)
+            covered = Covered.of(moved, bounds_um, smallest.grid, camera.lens_for(light), camera.n_threads)
     named_um = None if moving_um is None and not any(gaze_um) else gaze_um
     warn_of_coverage(source, covered, layout.n_sites, named_um, warned)
     return integrate_maps(sensor, light, maps, integrators, clock, footprints)

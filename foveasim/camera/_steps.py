@@ -204,6 +204,13 @@ def capture_settings(camera: Camera, light: Scene | PowerMap, exposure_s: float,
     }
 
 
+def _depth_settings(scene: Scene) -> dict[str, object]:
+    """Return the distances of a scene with depth."""
+    if scene.depth_m is None:
+        return {}
+    return {"depth_m": to_plain_data(scene.depth_m), "depth_layers": scene.depth_layers}
+
+
 def _light_settings(camera: Camera, light: Scene | PowerMap) -> dict[str, object]:
     if isinstance(light, PowerMap):
         return {
@@ -211,14 +218,21 @@ def _light_settings(camera: Camera, light: Scene | PowerMap) -> dict[str, object
             "grid": to_plain_data(light.grid),
             "wavelength_nm": light.wavelength_nm.tolist(),
         }
+    framed, panorama = camera.fit_scene(light), light.panorama
+    # The settings of a plane do not mention the projection.
+    directions = {} if framed.projection == "rectilinear" and panorama is None else {"projection": framed.projection}
+    if panorama is not None:
+        directions |= {"panorama": to_plain_data(panorama)}
     return {
         "kind": "Scene",
         "source": light.source,
         "shape": list(light.basis.shape),
-        "pitch_um": camera.fit_scene(light).pitch_um,
+        "pitch_um": framed.pitch_um,
+        **directions,
         "fit": light.fit,
         "field_of_view_deg": light.field_of_view_deg,
         "distance_m": light.distance_m,
+        **_depth_settings(light),
         "wavelength_nm": light.wavelength_nm.tolist(),
         "band_width_nm": light.band_width_nm.tolist(),
         "spectrum_w_m2_sr_nm": to_plain_data(light.spectrum_w_m2_sr_nm),

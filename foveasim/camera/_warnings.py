@@ -12,7 +12,7 @@ from foveasim._core.validation import Bools, Floats
 from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import CoverageWarning, ExposureWarning, FoveasimWarning, ParameterError, SamplingWarning, warn
-from foveasim.fields import Grid, PowerMap
+from foveasim.fields import Grid, PointMap, PowerMap
 from foveasim.integrate import Integrator
 from foveasim.layout.model import Layout
 from foveasim.optics import Optics
@@ -52,7 +52,7 @@ class Covered(NamedTuple):
 
     @classmethod
     def of(
-        cls, layout: Layout, bounds_um: Sequence[float], grid: Grid, distortion: Lens | None, n_threads: int
+        cls, layout: Layout, bounds_um: Sequence[float], grid: Grid, distortion: PointMap | None, n_threads: int
     ) -> Covered:
         """
         Return the coverage of a layout by a grid.
@@ -112,9 +112,8 @@ def warn_of_coverage(
             where = f" at the gaze {format_point(gaze_um)} µm"
         if fit == "cover":
             x_um, y_um = np.abs(gaze_um if gaze_um is not None else (0.0, 0.0))
-            remedy = (
-                f"use Scene.from_picture(..., gaze_range_um=({x_um:.4g}, {y_um:.4g})), or gazes nearer to the centre"
-            )
+            call = "from_picture" if isinstance(source, Scene) and source.panorama is None else "from_panorama"
+            remedy = f"use Scene.{call}(..., gaze_range_um=({x_um:.4g}, {y_um:.4g})), or gazes nearer to the centre"
         warn(
             f"{n_uncovered:,} of {n_sites:,} photosites lie partly or completely outside the image{where}, where "
             f"irradiance is 0: the image measures {_format_extent(image_um)}, the layout {_format_extent(layout_um)}; "

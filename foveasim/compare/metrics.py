@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from copy import copy
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -179,12 +180,14 @@ def _shift_gradients_e_per_um(camera: Camera, image: PowerMap, exposure_s: float
     It is 0 for sites that lie partly or entirely off the image.
     """
     grid, layout = image.grid, camera.layout
-    uncovered_um2 = camera.integrator(grid, order=camera.order(image)).uncovered_um2
+    uncovered_um2 = camera.integrator(
+        grid, order=camera.order(image), projection=camera.projection(image)
+    ).uncovered_um2
     moving = copy(camera)  # so that displaced images do not fill the cache of the camera
 
     def expected_e(x_um: float, y_um: float) -> Floats:
         x0_um, y0_um = grid.origin_um
-        moved = PowerMap(image.data, Grid(grid.shape, grid.pitch_um, (x0_um + x_um, y0_um + y_um)), image.wavelength_nm)
+        moved = replace(image, grid=Grid(grid.shape, grid.pitch_um, (x0_um + x_um, y0_um + y_um)))
         return camera.sensor.expected_electrons(moving.photoelectrons_per_s(moved), exposure_s)
 
     gradient = np.empty((layout.n_sites, 2))

@@ -164,6 +164,11 @@ _DISPLAY_TYPES: dict[str, Any] = {
     "cells": list[list[int]] | None,
 }
 _Point = tuple[float, float]
+#: Files of a scene with depth.
+_DEPTH: dict[str, Any] = {
+    "depth_m": Annotated[str, Field(description="a file with the distance of each pixel")],
+    "calibration": str | None,
+}
 #: Parameters of layout edits with other types in files than in Python.
 _EDIT_TYPES: dict[str, Any] = {
     "by_um": _Point,
@@ -287,12 +292,18 @@ def _models(_versions: tuple[int, ...]) -> Models:
     rules = _rules()
     layout = _layout(rules)
     power_map = _model("power_map", read_power_map, **(_FILE_TYPES | _WAVELENGTHS))
-    scenes = _registered_sections(SCENES, skip=_OF_ARRAYS, **(_FILE_TYPES | _WAVELENGTHS), display=_display())
+    scenes = _registered_sections(
+        SCENES, skip=_OF_ARRAYS, lens=lens | None, **(_FILE_TYPES | _WAVELENGTHS | _DEPTH), display=_display()
+    )
     scene = _union_of("kind", {**scenes, "power_map": power_map})
     fields: dict[str, Any] = {
         "scene": (
             scene,
-            Field(description="a photograph, a hyperspectral cube, a test chart, or a power map of another program"),
+            Field(
+                description=(
+                    "a photograph, a panorama, a hyperspectral cube, a test chart, or a power map of another program"
+                )
+            ),
         ),
         "optics": (optics, Field(description="parameters of the lens")),
         "distortion": (lens | None, Field(None, description="distortion model of the lens")),

@@ -54,8 +54,10 @@ BUNDLED_PICTURE = "skimage:"
 YAML_EXTENSIONS = (".yaml", ".yml")
 #: Settings whose value may be a file.
 FILE_SETTINGS = (
+    "calibration",
     "datasheet",
     "density",
+    "depth_m",
     "file",
     "gaze_path",
     "importance",
@@ -657,7 +659,7 @@ def _values(source: Source, prefix: str, section: BaseModel) -> dict[str, Any]:
 def _build(source: Source, key_path: str, value: Any) -> Any:
     if isinstance(value, list):
         return [_build(source, f"{key_path}[{i}]", item) for i, item in enumerate(value)]
-    if isinstance(value, str) and key_path.rpartition(".")[2] in {"path", "picture"}:
+    if isinstance(value, str) and key_path.rpartition(".")[2] in {"path", "picture", "depth_m", "calibration"}:
         return picture_path(source, value, key_path)
     if not isinstance(value, BaseModel) or isinstance(value, PerArea):
         return value

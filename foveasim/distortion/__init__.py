@@ -2,8 +2,9 @@
 Lens distortion models.
 
 A model maps points of the sensor plane: :meth:`distort` from the ideal (pinhole) position to the real position,
-:meth:`undistort` in the opposite direction. The simulation never resamples images: the integrator undistorts the outlines
-of the photosites once. :func:`distort_map` resamples a power map for display and comparison.
+:meth:`undistort` in the opposite direction. It also maps directions of rays, beyond 90° from the axis too: :meth:`direction`
+returns that of a real position, :meth:`project` is its inverse. The simulation never resamples images for distortion: the
+integrator undistorts the outlines of the photosites once. :func:`distort_map` resamples a power map for display and comparison.
 """
 
 from __future__ import annotations

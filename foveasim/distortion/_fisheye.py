@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 
 from foveasim._core.calls import POSITIVE, OwnCheck
 from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, check_number, finite_array
+from foveasim._projections import LAWS, MIN_RADIUS, FisheyeProjection, angles_of, directions_at, points_at
 from foveasim.distortion._lens import LensBase
 from foveasim.distortion._registry import LENSES
 from foveasim.distortion._solve import invert_monotonic, smallest_roots
 from foveasim.errors import ParameterError
 
-Projection = Literal["equidistant", "equisolid", "stereographic", "orthographic"]
-#: Image height as a function of the angle, and its inverse.
-PROJECTIONS: dict[Projection, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]] = {
-    "equidistant": (lambda theta_rad: theta_rad, lambda height: height),
-    "equisolid": (lambda theta_rad: 2.0 * np.sin(0.5 * theta_rad), lambda height: 2.0 * np.arcsin(0.5 * height)),
-    "stereographic": (lambda theta_rad: 2.0 * np.tan(0.5 * theta_rad), lambda height: 2.0 * np.arctan(0.5 * height)),
-    "orthographic": (np.sin, np.arcsin),
-}
-#: Points within this normalised radius are scaled linearly, which avoids a division by 0.
-MIN_RADIUS = 1e-12
+#: Largest image height of models without a fold, in focal lengths.
+MAX_HEIGHT = 1e6
 #: Largest number of coefficients of Scaramuzza's polynomial.
 MAX_COEFFICIENTS = 10
 #: Margin below 90° in radians, where the pinhole projection diverges.
@@ -42,8 +35,21 @@ class _AngularLens(LensBase):
     def _theta_rad(self, height: Floats) -> Floats:
         raise NotImplementedError
 
-    def _max_theta_rad(self) -> float:
+    def _largest_rad(self) -> float:
+        """Return the largest angle to the axis, beyond 90° where the model allows it."""
         raise NotImplementedError
+
+    def _wide_height(self, theta_rad: Floats) -> Floats:
+        """Return the image height at angles that may exceed 90°."""
+        return self._height(theta_rad)
+
+    def _wide_theta_rad(self, height: Floats) -> Floats:
+        """Return the angle at image heights that may lie beyond that of 90°."""
+        return self._theta_rad(height)
+
+    def _max_theta_rad(self) -> float:
+        """Return the largest angle of points of a plane in front of the lens."""
+        return min(self._largest_rad(), 0.5 * math.pi - ANGLE_MARGIN_RAD)
 
     def _limits(self) -> tuple[float, float]:
         max_rad = self._max_theta_rad()
@@ -67,6 +73,26 @@ class _AngularLens(LensBase):
         is_inside = radius <= self._max_image_height
         theta_rad = self._theta_rad(np.where(is_inside, radius, 0.0))
         return _scale_radially(xy, radius, np.where(is_inside, np.tan(theta_rad), np.nan), 1.0 / float(self._slope()))
+
+    @cached_property
+    def _largest_height(self) -> float:
+        """Image height at the largest angle, beyond 90° where the model allows it."""
+        return float(self._wide_height(np.array([self._largest_rad()]))[0])
+
+    def _wide_limits(self) -> tuple[float, float]:
+        return self._largest_rad(), self._largest_height
+
+    def _to_directions(self, xy: Floats) -> Floats:
+        radius = np.hypot(xy[:, 0], xy[:, 1])
+        is_inside = radius <= self._largest_height
+        theta_rad = self._wide_theta_rad(np.where(is_inside, radius, 0.0))
+        return directions_at(xy, radius, np.where(is_inside, theta_rad, np.nan), 1.0 / float(self._slope()))
+
+    def _from_directions(self, directions: Floats) -> Floats:
+        across, theta_rad = angles_of(directions)
+        is_inside = theta_rad <= self._largest_rad()
+        height = self._wide_height(np.where(is_inside, theta_rad, 0.0))
+        return points_at(directions, across, np.where(is_inside, height, np.nan), float(self._slope()))
 
     def _slope(self) -> float:
         """Return the derivative of the image height with respect to the angle at the axis."""
@@ -106,7 +132,8 @@ class Fisheye(_AngularLens):
 
     Notes
     -----
-    The scene is a plane in front of the lens: rays at less than 90° to the axis have the ideal position f tan θ.
+    Rays at less than 90° to the axis have the position f tan θ in the plane of :meth:`distort`. :meth:`direction` and
+    :meth:`project` are valid up to 180°, with the orthographic projection up to 90°.
 
     Examples
     --------
@@ -115,18 +142,19 @@ class Fisheye(_AngularLens):
     [[785.398, 0.0]]
     """
 
-    projection: Projection
+    projection: FisheyeProjection
     focal_um: OwnCheck[float | tuple[float, float]]
     centre_um: tuple[float, float] = (0.0, 0.0)
 
     def _height(self, theta_rad: Floats) -> Floats:
-        return PROJECTIONS[self.projection][0](theta_rad)
+        return LAWS[self.projection].height(theta_rad)
 
     def _theta_rad(self, height: Floats) -> Floats:
-        return PROJECTIONS[self.projection][1](height)
+        return LAWS[self.projection].angle_rad(height)
 
-    def _max_theta_rad(self) -> float:
-        return 0.5 * math.pi - ANGLE_MARGIN_RAD
+    def _largest_rad(self) -> float:
+        law = LAWS[self.projection]
+        return law.max_rad - (ANGLE_MARGIN_RAD if math.isinf(law.max_height) else 0.0)
 
 
 @LENSES.register(
@@ -152,7 +180,7 @@ class PolynomialFisheye(_AngularLens):
 
     Notes
     -----
-    The model is valid up to the angle at which the height stops increasing, at most 90°.
+    The model is valid up to the angle at which the height stops increasing; :meth:`distort` and :meth:`undistort` up to 90°.
 
     Examples
     --------
@@ -182,10 +210,18 @@ class PolynomialFisheye(_AngularLens):
 
     @cached_property
     def _max_angle_rad(self) -> float:
-        return min(float(smallest_roots(self._series.deriv().coef)[0]), 0.5 * math.pi - ANGLE_MARGIN_RAD)
+        return self._max_theta_rad()
 
-    def _max_theta_rad(self) -> float:
-        return self._max_angle_rad
+    @cached_property
+    def _fold_rad(self) -> float:
+        """Angle at which the height stops increasing, at most 180°."""
+        return min(float(smallest_roots(self._series.deriv().coef)[0]), math.pi)
+
+    def _largest_rad(self) -> float:
+        return self._fold_rad
+
+    def _wide_theta_rad(self, height: Floats) -> Floats:
+        return invert_monotonic(self._series, self._series.deriv(), height, self._fold_rad)
 
     def _height(self, theta_rad: Floats) -> Floats:
         return np.asarray(self._series(theta_rad))
@@ -230,7 +266,7 @@ class Scaramuzza(_AngularLens):
     Notes
     -----
     Equations 7 and 8 of the paper, with r̃ = sqrt(x̃² + ỹ²). The model is valid up to the radius r at which the angle stops
-    increasing, and for angles of less than 90°.
+    increasing; :meth:`distort` and :meth:`undistort` for angles of less than 90°.
 
     Examples
     --------
@@ -276,9 +312,14 @@ class Scaramuzza(_AngularLens):
 
     @cached_property
     def _max_height(self) -> float:
-        depth = self._depth
-        growth = depth - np.polynomial.Polynomial([0.0, 1.0]) * depth.deriv()
-        return float(min(*smallest_roots(depth.coef), *smallest_roots(growth.coef)))
+        """Image height at the fold or at 90°, whichever is smaller."""
+        return float(min(*smallest_roots(self._depth.coef), self._fold_height))
+
+    @cached_property
+    def _fold_height(self) -> float:
+        """Image height at which the angle stops increasing."""
+        growth = self._depth - np.polynomial.Polynomial([0.0, 1.0]) * self._depth.deriv()
+        return float(smallest_roots(growth.coef)[0])
 
     def _limits(self) -> tuple[float, float]:
         # The stretched image circle is an ellipse: use the radius of its largest inscribed circle.
@@ -288,10 +329,11 @@ class Scaramuzza(_AngularLens):
     def _slope(self) -> float:
         return 1.0 / float(self._depth.coef[0])
 
-    def _max_theta_rad(self) -> float:
-        if math.isinf(self._max_height):
-            return 0.5 * math.pi - ANGLE_MARGIN_RAD
-        return min(float(self._angle_rad(np.array([self._max_height]))[0]), 0.5 * math.pi - ANGLE_MARGIN_RAD)
+    def _largest_rad(self) -> float:
+        height = min(self._fold_height, MAX_HEIGHT)
+        angle_rad = float(self._angle_rad(np.array([height]))[0])
+        # Without a fold, the angle approaches 90° (a pinhole) or 180°.
+        return angle_rad if height < MAX_HEIGHT else max(angle_rad, 0.5 * math.pi - ANGLE_MARGIN_RAD)
 
     def _angle_rad(self, height: Floats) -> Floats:
         return np.asarray(np.arctan2(height, self._depth(height)))
@@ -304,7 +346,12 @@ class Scaramuzza(_AngularLens):
         return self._angle_rad(height)
 
     def _height(self, theta_rad: Floats) -> Floats:
-        upper = self._max_height
+        return self._height_up_to(self._max_height, theta_rad)
+
+    def _wide_height(self, theta_rad: Floats) -> Floats:
+        return self._height_up_to(self._fold_height, theta_rad)
+
+    def _height_up_to(self, upper: float, theta_rad: Floats) -> Floats:
         if math.isinf(upper):  # without a limit, double until the height covers the largest angle
             upper = 1.0
             max_rad = float(np.max(theta_rad, initial=0.0))
@@ -317,3 +364,13 @@ class Scaramuzza(_AngularLens):
 
     def _backward(self, xy: Floats) -> Floats:
         return super()._backward(xy @ np.linalg.inv(self._matrix).T)
+
+    def _wide_limits(self) -> tuple[float, float]:
+        angle_rad, height = super()._wide_limits()
+        return angle_rad, height * float(np.linalg.svd(self._matrix, compute_uv=False).min())
+
+    def _to_directions(self, xy: Floats) -> Floats:
+        return super()._to_directions(xy @ np.linalg.inv(self._matrix).T)
+
+    def _from_directions(self, directions: Floats) -> Floats:
+        return np.asarray(super()._from_directions(directions) @ self._matrix.T)

@@ -85,6 +85,12 @@ def distort_map(
     """
     if not (hasattr(lens, "undistort") and (grid is not None or hasattr(lens, "distort"))):
         raise ParameterError("lens", "must be a lens of foveasim.distortion", lens)
+    if power_map.projection != "rectilinear":
+        raise ParameterError(
+            "power_map",
+            f"must be rectilinear, got an {power_map.projection} image",
+            hint="pass camera.lens_for(power_map) to foveasim.Integrator instead",
+        )
     if grid is None:
         grid = _bounding_grid(power_map.grid, lens)
     if math.prod(grid.shape) > MAX_CELLS:

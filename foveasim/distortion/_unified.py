@@ -15,6 +15,14 @@ from foveasim.distortion._brown_conrady import BrownConrady, directions
 from foveasim.distortion._fisheye import ANGLE_MARGIN_RAD, _AngularLens
 from foveasim.distortion._registry import LENSES
 
+#: Margin below 180° in radians, where the sum of 1 and the cosine is not accurate.
+BACK_MARGIN_RAD = 1e-6
+
+
+def _with_margin(largest_rad: float) -> float:
+    """Return an angle below the largest one, at which heights diverge or stop increasing."""
+    return min(largest_rad - ANGLE_MARGIN_RAD, math.pi - BACK_MARGIN_RAD)
+
 
 @LENSES.register(
     "omnidirectional",
@@ -72,8 +80,9 @@ class Omnidirectional(_AngularLens):
         u = height / (1.0 + self.xi)
         return np.asarray(np.arctan(u) + np.arcsin(np.clip(u * self.xi / np.hypot(1.0, u), -1.0, 1.0)))
 
-    def _max_theta_rad(self) -> float:
-        return 0.5 * math.pi - ANGLE_MARGIN_RAD
+    def _largest_rad(self) -> float:
+        # The ray is parallel to the plane, or beyond ξ = 1 touches the sphere.
+        return _with_margin(math.acos(-min(self.xi, 1.0 / self.xi) if self.xi > 0.0 else 0.0))
 
     @cached_property
     def _distortion(self) -> BrownConrady | None:
@@ -94,6 +103,30 @@ class Omnidirectional(_AngularLens):
             return super()._backward(xy)
         scale = 1.0 + self.xi
         return super()._backward(scale * self._distortion._backward(xy / scale))  # noqa: SLF001 -- normalised points
+
+    def _to_directions(self, xy: Floats) -> Floats:
+        if self._distortion is None:
+            return super()._to_directions(xy)
+        scale = 1.0 + self.xi
+        return super()._to_directions(scale * self._distortion._backward(xy / scale))  # noqa: SLF001 -- normalised points
+
+    def _from_directions(self, directions: Floats) -> Floats:
+        found = super()._from_directions(directions)
+        if self._distortion is None:
+            return found
+        scale = 1.0 + self.xi
+        return scale * self._distortion._forward(found / scale)  # noqa: SLF001 -- normalised points
+
+    def _wide_limits(self) -> tuple[float, float]:
+        largest_rad, height = super()._wide_limits()
+        if self._distortion is None:
+            return largest_rad, height
+        scale = 1.0 + self.xi
+        fold, real = self._distortion._limits()  # noqa: SLF001 -- normalised radii
+        if scale * fold < height:
+            return float(self._theta_rad(np.array([scale * fold]))[0]), scale * real
+        boundary = height / scale * directions()
+        return largest_rad, scale * float(np.hypot(*self._distortion._forward(boundary).T).min())  # noqa: SLF001
 
     def _limits(self) -> tuple[float, float]:
         ideal, height = super()._limits()
@@ -158,8 +191,10 @@ class ExtendedUnified(_AngularLens):
         depth = (1.0 - b * a**2 * h2) / (a * root + 1.0 - a)
         return np.asarray(np.arctan2(height, depth))
 
-    def _max_theta_rad(self) -> float:
-        return 0.5 * math.pi - ANGLE_MARGIN_RAD
+    def _largest_rad(self) -> float:
+        ratio = self.alpha / (1.0 - self.alpha) if self.alpha <= 0.5 else (1.0 - self.alpha) / self.alpha
+        depth = -ratio * math.sqrt(self.beta)
+        return _with_margin(math.atan2(math.sqrt(max(1.0 - ratio * ratio, 0.0)), depth))
 
 
 @LENSES.register(
@@ -216,10 +251,10 @@ class DoubleSphere(_AngularLens):
         along = (depth * xi + np.sqrt(depth**2 + (1.0 - xi**2) * r**2)) / (depth**2 + r**2)
         return np.asarray(np.arctan2(along * r, along * depth - xi))
 
-    def _max_theta_rad(self) -> float:
+    def _largest_rad(self) -> float:
         ratio = self.alpha / (1.0 - self.alpha) if self.alpha <= 0.5 else (1.0 - self.alpha) / self.alpha
         highest = (ratio + self.xi) / math.sqrt(2.0 * ratio * self.xi + self.xi**2 + 1.0)
-        return min(math.acos(max(-1.0, min(-highest, 1.0))), 0.5 * math.pi) - ANGLE_MARGIN_RAD
+        return _with_margin(math.acos(max(-1.0, min(-highest, 1.0))))
 
 
 @LENSES.register(
@@ -269,5 +304,12 @@ class FieldOfView(_AngularLens):
     def _theta_rad(self, height: Floats) -> Floats:
         return np.asarray(np.arctan(np.tan(self._strength * height) / self._strength))
 
-    def _max_theta_rad(self) -> float:
-        return 0.5 * math.pi - ANGLE_MARGIN_RAD
+    def _largest_rad(self) -> float:
+        return math.pi
+
+    def _wide_height(self, theta_rad: Floats) -> Floats:
+        return np.asarray(np.arctan2(self._strength * np.sin(theta_rad), np.cos(theta_rad)) / self._strength)
+
+    def _wide_theta_rad(self, height: Floats) -> Floats:
+        angle_rad = self._strength * height
+        return np.asarray(np.arctan2(np.sin(angle_rad), self._strength * np.cos(angle_rad)))

@@ -58,14 +58,15 @@ class UndistortedOutlines:
 
     ``lens``: object with ``undistort(xy_um, outside="mask")``, which returns NaN for points outside its image circle.
     ``pitch_um``: shorter side of the cells of the map: edges are split until the chord error is at most 0.1 % of this
-    length.
+    length, or the fraction ``lens.chord_tolerance``.
 
     Sites with a vertex outside the image circle are marked as lost and remain in the sensor plane. Edges shared by two
     sites are split at identical points, so that tilings have no gaps or overlaps after the transformation.
     """
 
     def __init__(self, layout: PackedRings, lens: PointMap, pitch_um: float) -> None:
-        self._layout, self._lens, self._chord_um = layout, lens, CHORD_TOLERANCE * pitch_um
+        self._layout, self._lens = layout, lens
+        self._chord_um = getattr(lens, "chord_tolerance", CHORD_TOLERANCE) * pitch_um
 
     def __call__(self, first: int, last: int) -> Outlines:
         """Return the outlines of the sites ``first`` to ``last - 1``."""

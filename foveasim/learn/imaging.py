@@ -100,6 +100,10 @@ class Imaging(nn.Module):
         super().__init__()
         if optics.lateral_colour is not None:
             raise ParameterError("optics", "must have no lateral chromatic aberration for gradients", optics)
+        if getattr(scene, "depth_m", None) is not None:
+            raise ParameterError(
+                "scene", "must be a plane for PyTorch, got one with depth; its layers have no gradients", scene
+            )
         self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
         if self.wrt and optics.psfs is not None:
             raise ParameterError("wrt", "must be empty for a lens with 'psfs', whose aberrations are fixed", self.wrt)

@@ -105,6 +105,10 @@ class Model(nn.Module):
         super().__init__()
         self.wrt: tuple[str, ...] = _check_variables("wrt", wrt, VARIABLES)
         self._camera, self._scene = camera, camera.light_at_gaze(scene)
+        if scene.panorama is not None or self._scene.projection != "rectilinear":
+            raise ParameterError(
+                "scene", "must be a plane for sensor layers: they have no derivatives of panoramas", scene
+            )
         self._boundary: Literal["fixed", "sliding", "free"] = boundary
         sensor = camera.sensor
         self.imaging: Imaging = Imaging(

@@ -145,6 +145,12 @@ def write_power_map(power_map: PowerMap, path: str | Path) -> None:
     --------
     >>> write_power_map(power_map, "map.fits")  # doctest: +SKIP
     """
+    if isinstance(power_map, PowerMap) and power_map.projection != "rectilinear":
+        raise ParameterError(
+            "power_map",
+            f"must be rectilinear for a file, got an {power_map.projection} image",
+            hint="files contain no projection: capture the scene instead",
+        )
     path = Path(path)
     form = select_writer(path, MAP_FORMATS)
     assert form.write is not None

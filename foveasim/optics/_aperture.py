@@ -24,7 +24,7 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Bools, Floats
 from foveasim.errors import ParameterError, type_name
 from foveasim.optics._quadrature import Nodes, PupilEdges, joined, plane_waves, pupil_nodes
-from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider
+from foveasim.optics.pupils import Annulus, Blades, Half, Pupil, PupilImage, Slit, Spider
 from foveasim.units import um_from_nm
 
 #: Samples across an unaberrated aperture; the OTF is then accurate to 4e-4.
@@ -39,6 +39,8 @@ PUPIL_POINTS = 1535
 MAX_CACHED_MEANS = 4
 #: Points across the aperture at which the wavefront slope is evaluated.
 SLOPE_POINTS = 193
+#: Half the distance of the points of a central difference, in radii.
+SLOPE_STEP = 1e-4
 #: Frequencies of the quadrature in radians per radius: the first beyond the geometric blur, the factor between attempts, and
 #: the limit beyond which a pupil is sampled.
 FIRST_RADIANS, RADIANS_STEP, MAX_RADIANS = 8.0, 1.5, 500.0
@@ -202,6 +204,11 @@ class Aperture:
         """Whether the OTF is that of a clear circle in focus."""
         return not self.pupils and not self.wavefronts and self.defocus_um == 0.0
 
+    @property
+    def is_defocused_circle(self) -> bool:
+        """Whether the OTF is that of a clear circle, in focus or not."""
+        return not self.pupils and not self.wavefronts
+
     def illumination(self, field_um: Floats) -> None:
         """Return None: the relative illumination is that of the thin lens."""
 
@@ -212,7 +219,7 @@ class Aperture:
     @cached_property
     def is_achromatic(self) -> bool:
         """Whether all pupils are known to be independent of the wavelength."""
-        plain = (Annulus, Blades, Slit, Spider)
+        plain = (Annulus, Blades, Half, Slit, Spider)
         return all(isinstance(p, plain) or (isinstance(p, PupilImage) and p.wavefront_um is None) for p in self.pupils)
 
     @cached_property
@@ -295,6 +302,14 @@ class Aperture:
         for part in self.wavefronts:
             total_um = total_um + part.wavefront_um(x, y, wavelength_nm, field_um)
         return np.asarray(total_um)
+
+    def ray_slopes(self, points: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:
+        """Return the slope of the wavefront along x and y, µm per radius, at points (n, 2)."""
+        x, y = points.T
+        step = SLOPE_STEP
+        path_um = partial(self.path_um, wavelength_nm=wavelength_nm, field_um=field_um)
+        along_x, along_y = path_um(x + step, y) - path_um(x - step, y), path_um(x, y + step) - path_um(x, y - step)
+        return np.stack((along_x, along_y), axis=1) / (2.0 * step)
 
     def blur_lambda_n(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
         """Return the largest geometric ray displacement in units of λN: twice the slope in waves."""

@@ -12,10 +12,14 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.calls import Limits, check_declared
 from foveasim._core.short_repr import short_repr
-from foveasim._core.validation import Floats, finite_array
+from foveasim._core.validation import Floats, finite_array, read_only
+from foveasim._projections import LAWS, ImageProjection
 from foveasim.errors import ParameterError
+from foveasim.fields import Grid
 from foveasim.incidence import HEIGHT, check_heights
 
+#: Points of a cell along each axis, in cells from its centre: nodes of Gauss and Legendre.
+CELL_NODES = 0.5 / 3.0**0.5
 #: Relative illumination: above 1 where pupil aberration enlarges the pupil off the axis.
 ILLUMINATION = Limits(at_least=0.0, at_most=4.0, hint="relative illumination is a fraction of that on the axis")
 
@@ -85,3 +89,25 @@ def _interpolant(table: IlluminationTable) -> Callable[[Floats], Floats]:
 
     found: Callable[[Floats], Floats] = PchipInterpolator(table.image_height_um, table.fraction)
     return found
+
+
+def solid_angles_sr(grid: Grid, focal_um: float, projection: ImageProjection, *, is_flat: bool) -> Floats:
+    """
+    Return the mean solid angle per area of the cells of an image, (n_y, n_x) sr.
+
+    Areas are in squared focal lengths. ``is_flat``: times the cosine of the angle to the axis, for a flat pupil. Beyond the
+    largest angle of the projection it is 0.
+    """
+    law = LAWS[projection]
+    x, y = (
+        ((np.arange(n) - 0.5 * (n - 1)) * pitch + c) / focal_um
+        for n, pitch, c in zip(grid.shape[::-1], grid.pitch_xy_um, grid.centre_um, strict=True)
+    )
+    step = CELL_NODES * grid.pitch_xy_um / focal_um
+    total = np.zeros(grid.shape)
+    for side_x in (-step[0], step[0]):
+        for side_y in (-step[1], step[1]):
+            theta_rad = law.angles_rad(np.hypot(x + side_x, (y + side_y)[:, np.newaxis]))
+            value = law.solid_angle_sr(theta_rad)
+            total += np.nan_to_num(value * np.maximum(np.cos(theta_rad), 0.0) if is_flat else value)
+    return read_only(0.25 * total)

@@ -6,9 +6,9 @@ import inspect
 import math
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,16 +22,17 @@ from foveasim.errors import ParameterError, SamplingWarning, warn
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.incidence import N_RINGS, N_RINGS_OF_PUPILS, ChiefRayTable, Incidence, cone_irradiance_sr
 from foveasim.optics._aperture import Aperture, PSFModel, Wavefront, overlaps
-from foveasim.optics._illumination import IlluminationTable
+from foveasim.optics._illumination import IlluminationTable, solid_angles_sr
 from foveasim.optics._point_images import Point, PointImages
 from foveasim.optics.aberrations import LateralColour, Seidel, Zernike
 from foveasim.optics.otf import MAX_ALIASES, ONE_POINT, PlaneTables, RadialTables, TableCache, Tables
 from foveasim.optics.psfs._field import FieldPSFs
 from foveasim.optics.psfs._grid import PSFGrid
-from foveasim.optics.pupils import Pupil
+from foveasim.optics.pupils import Half, Pupil
 from foveasim.units import m_from_mm, m_from_um, um_from_m, um_from_nm
 
 if TYPE_CHECKING:
+    from foveasim.optics._depth import Layer, LayerLight, Layers
     from foveasim.optics._field_modes import FieldModes, FieldWeight
     from foveasim.optics._imaging import Imaging, MapRows
     from foveasim.optics._transform import Factor, Transform
@@ -47,6 +48,10 @@ CONE_NM = 550.0
 LOST_FRACTION = 0.01
 #: Fraction of the PSF energy that an isoplanatic patch may displace.
 PATCH_LOST_FRACTION = 0.002
+#: Part of a layer of a scene with depth.
+LayerPart: TypeAlias = Literal["light", "cover"]
+#: Largest number of layers whose apertures are cached.
+MAX_LAYERS = 256
 #: Factor by which the aperture radius should exceed H λ / (p0 min(M, N)); the paper's Eq. 5 requires "much larger".
 MIN_RADIUS_RATIO = 10.0
 #: Largest number of cells along a source pixel.
@@ -78,6 +83,16 @@ def _pitch_um(scene: SceneLike) -> float:
             "must have a pixel pitch, which with 'fit' depends on the layout; pass camera.fit_scene(scene), or set 'pitch_um'",
         )
     return scene.pitch_um
+
+
+def depth_of(scene: SceneLike) -> Floats | None:
+    """Return the distance of each pixel of a scene with depth, (n_y, n_x) m."""
+    return getattr(scene, "depth_m", None)
+
+
+def _depth_range_m(scene: SceneLike) -> tuple[float, float] | None:
+    """Return the smallest and the largest distance of a scene with depth."""
+    return None if depth_of(scene) is None else getattr(scene, "depth_range_m")  # noqa: B009 -- not of every scene
 
 
 def _is_pupil(pupil: object) -> bool:
@@ -124,6 +139,15 @@ class Optics(PointImages):
         On-axis irradiance for a Lambertian scene of radiance L and the image-side f-number N: ``π L / (1 + 4 N²)`` for the
         thin lens of the paper and ISETCam, or ``π L / (4 N²)`` for an aplanatic lens, which satisfies Abbe's sine condition,
         as corrected photographic lenses do. The second is higher by 1.6 % at f/4, 3.2 % at f/2.8, 13 % at f/1.4.
+    projection : {"auto", "rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"}
+        Projection of the image: the image height f tan θ, f θ, 2 f sin(θ/2), 2 f tan(θ/2) or f sin θ of a ray at the angle θ
+        to the axis, of a panorama. Without a lens model it is that of the lens. With one, it is that of the intermediate image,
+        on which results do not depend. ``"auto"``: that nearest to the lens model of a camera, rectilinear without one. The
+        image of a plane is rectilinear; for others, a camera needs a lens model.
+    pupil_tilt : {"auto", "flat", "turning"}
+        Whether the entrance pupil is a flat disc, which a ray at the angle θ meets with the area π a² cos θ, or turns towards
+        the field, as in most fisheye lenses, with the area π a². Relative illumination is the area times the solid angle per
+        area of the image: cos⁴ θ or cos³ θ for a rectilinear image. ``"auto"``: flat for rectilinear images, else turning.
     transmission : float
         Power transmittance of the glass.
     pupil : Annulus, Spider, Blades, Slit, PupilImage, callable, or a sequence of them, optional
@@ -172,6 +196,9 @@ class Optics(PointImages):
         distance. It determines the chief ray angles at the sites of a sensor with ``pixel_optics`` (see :meth:`incidence`), and
         the relative illumination: the integral of the radiance over the cone at each point, instead of the law of the fourth
         power of the cosine of the field angle. For pupils with a central obscuration it is that of the clear circle.
+    pupil_part : {"full", "left", "right"}
+        Half of the pupil behind the photodiodes of one side of dual pixels. The energies of both halves add up to that of the
+        full pupil, but not their PSFs, since the halves diffract separately: use the full pupil for the sum.
     chief_ray : ChiefRayTable, optional
         Chief ray angles at image heights, instead of an exit pupil; beyond the last height, those there.
 
@@ -216,6 +243,8 @@ class Optics(PointImages):
     f_number: Annotated[float, F_NUMBER, Usual(1.0, 32.0)]
     emission: Literal["lambertian", "isotropic"] = "lambertian"
     lens: Literal["thin", "aplanatic"] = "thin"
+    projection: Literal["auto", "rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"] = "auto"
+    pupil_tilt: Literal["auto", "flat", "turning"] = "auto"
     transmission: Annotated[float, Limits(above=0.0, at_most=1.0)] = 1.0
     pupil: OwnCheck[Pupil | Sequence[Pupil] | None] = None
     zernike: Zernike | None = None
@@ -233,6 +262,7 @@ class Optics(PointImages):
     padding_cells: Annotated[int | None, Limits(at_least=0, at_most=2**20)] = None
     precision: Literal["single", "double"] = "single"
     exit_pupil_mm: Annotated[float | None, Usual(1.0, 200.0)] = None
+    pupil_part: Literal["full", "left", "right"] = "full"
     chief_ray: ChiefRayTable | None = None
     _cache: TableCache = field(default_factory=TableCache, init=False, repr=False, compare=False)
 
@@ -252,8 +282,8 @@ class Optics(PointImages):
                 "pupil", "must be a pupil of foveasim.optics, or a callable T(x, y, wavelength_nm)", self.pupil
             )
         if self.psfs is not None:
-            for name in ("pupil", "zernike", "seidel"):
-                if getattr(self, name) is not None:
+            for name in ("pupil", "zernike", "seidel", "pupil_part"):
+                if getattr(self, name) not in (None, "full"):
                     raise ParameterError(name, "must not be given with 'psfs', which contain it", getattr(self, name))
             if self.relative_illumination is not None and self.psfs.relative_illumination is not None:
                 raise ParameterError(
@@ -266,11 +296,20 @@ class Optics(PointImages):
             object.__setattr__(self, "exit_pupil_mm", distance_mm)
             if self.chief_ray is not None:
                 raise ParameterError("exit_pupil_mm", "must not be given with 'chief_ray'", distance_mm, "mm")
+        self._require_lambertian(self.projection)
         if self.field_patches is not None and self.is_varying and self.padding == "periodic":
             raise ParameterError(
                 "padding",
                 "must not be 'periodic' with 'field_patches'",
                 hint="choose 'reflect', 'edge' or 'zero', or omit 'field_patches': patches beyond the picture are undefined",
+            )
+
+    def _require_lambertian(self, projection: str) -> None:
+        if projection not in ("auto", "rectilinear") and self.emission != "lambertian":
+            raise ParameterError(
+                "emission",
+                f"must be 'lambertian' for the {projection} projection: isotropic points are those of a plane",
+                self.emission,
             )
 
     # -- geometry -------------------------------------------------------------------------------------------------
@@ -411,7 +450,7 @@ class Optics(PointImages):
     def _view(self, scene: SceneLike) -> View:
         """Return what follows from the geometry and the wavelengths of a scene."""
         geometry = scene.basis.shape[1:], scene.pitch_um, scene.distance_m, tuple(scene.centre_um)
-        key = *geometry, scene.wavelength_nm.tobytes()
+        key = *geometry, scene.wavelength_nm.tobytes(), _depth_range_m(scene)
         found: View = self._cache.views.get(key, lambda: self._make_view(scene))
         return found
 
@@ -502,10 +541,13 @@ class Optics(PointImages):
         """Return the number of source pixels that transforms add around a scene, for the blur."""
         from foveasim.optics._transform import source_pixels
 
-        pad, aperture = self.padding_cells, self._aperture(scene.distance_m)
+        pad = self.padding_cells
         if pad is None:
             pixels = Grid.centred(grid.shape, grid.pitch_x_um, grid.centre_um)
-            pad = self._reach_cells(scene, pixels, aperture, lambda_n_um, LOST_FRACTION)
+            pad = max(
+                self._reach_cells(scene, pixels, aperture, lambda_n_um, LOST_FRACTION)
+                for aperture in self._extreme_apertures(scene)
+            )
         return math.prod(source_pixels(n, self.padding, pad).size for n in grid.shape) - math.prod(grid.shape)
 
     def auto_oversample_error(self, scene: SceneLike) -> float:
@@ -548,8 +590,13 @@ class Optics(PointImages):
         ParameterError
             When the scene is not a Scene or is too near, the pupil is empty, or the aberrations exceed the largest blur.
         """
-        grid, aperture = self.grid(scene), self._aperture(scene.distance_m)
-        if not aperture.is_clear_circle:
+        grid, depths_m = self.grid(scene), _depth_range_m(scene)
+        is_deep = depths_m is not None and depths_m[0] < depths_m[1]
+        for aperture in self._extreme_apertures(scene):
+            if aperture.is_clear_circle or (
+                is_deep and isinstance(aperture, Aperture) and aperture.is_defocused_circle
+            ):
+                continue
             for wave_nm in scene.wavelength_nm:
                 aperture.transmittance(float(wave_nm))
                 for point_um in self._field_points_um(grid):
@@ -557,7 +604,7 @@ class Optics(PointImages):
 
     # -- irradiance -----------------------------------------------------------------------------------------------
 
-    def power_map(self, scene: SceneLike, *, n_threads: int | None = None) -> PowerMap:
+    def power_map(self, scene: SceneLike, *, n_threads: int | None = None, reference: bool = False) -> PowerMap:
         """
         Compute the irradiance on the sensor plane for each wavelength.
 
@@ -566,6 +613,9 @@ class Optics(PointImages):
         scene : Scene
         n_threads : int, optional
             All cores by default.
+        reference : bool
+            For a scene with depth: rays through 288 points of the pupil, at each of which near layers hide far ones, without
+            diffraction. Slow; shows the error of layers that cover each other.
 
         Returns
         -------
@@ -581,9 +631,12 @@ class Optics(PointImages):
         grid = self._refine(self.grid(scene))
         n_bands = scene.wavelength_nm.size
         data = np.empty((n_bands, *grid.shape), self._real_type())
+        if reference:
+            self._write_reference(scene, grid, data)
+            return PowerMap(read_only(data), grid, scene.wavelength_nm)
         for band, cells in enumerate(self.weighted_maps(scene, np.eye(n_bands), n_threads=n_threads)):
             data[band] = cells
-        return PowerMap(read_only(data), grid, scene.wavelength_nm)
+        return PowerMap(read_only(data), grid, scene.wavelength_nm, projection=scene.projection)
 
     def weighted_maps(
         self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int | None = None
@@ -686,12 +739,147 @@ class Optics(PointImages):
             yield partial(rows_of, total.astype(self._real_type()))
 
     def _maps(self, scene: SceneLike, weights: Floats, grid: Grid, n_threads: int) -> Iterator[MapRows]:
+        if depth_of(scene) is not None:
+            return self._maps_with_depth(scene, weights, grid, n_threads)
+        return self._plane_maps(scene, weights, grid, n_threads)
+
+    def _plane_maps(
+        self,
+        scene: SceneLike,
+        weights: Floats,
+        grid: Grid,
+        n_threads: int,
+        object_m: float | None = None,
+        layer_part: LayerPart | None = None,
+    ) -> Iterator[MapRows]:
         from foveasim.optics._imaging import isoplanatic_maps
 
-        imaging, tables_at = self.imaging(scene, weights, grid=grid, n_threads=n_threads)
+        imaging, tables_at = self.imaging(
+            scene, weights, grid=grid, n_threads=n_threads, object_m=object_m, layer_part=layer_part
+        )
         if self.field_patches is None or not self.is_varying:
             return imaging.maps(tables_at((0.0, 0.0)))
         return isoplanatic_maps(imaging, self.n_patches, tables_at)
+
+    def _maps_with_depth(self, scene: SceneLike, weights: Floats, grid: Grid, n_threads: int) -> Iterator[MapRows]:
+        """Yield maps of a scene with depth; all maps are in memory together."""
+        from foveasim.optics._depth import composed_maps, mean_spectrum
+        from foveasim.optics._imaging import rows_of
+
+        lens = self._focused(scene)
+        layers = lens._layers(scene)  # noqa: SLF001 -- same class
+        if len(layers.layers) == 1:
+            yield from lens._plane_maps(scene, weights, grid, n_threads, layers.layers[0].distance_m)  # noqa: SLF001
+            return
+
+        def maps_of(light: LayerLight, layer: Layer, is_cover: bool) -> Iterator[MapRows]:
+            part: LayerPart = "cover" if is_cover else "light"
+            return lens._plane_maps(light, weights, grid, n_threads, layer.distance_m, part)  # noqa: SLF001
+
+        white = lens._on_axis_w_m2(scene, mean_spectrum(scene)[np.newaxis], grid)[0]  # noqa: SLF001
+        maps = composed_maps(scene, layers, maps_of, weights @ white, grid.shape, self._real_type())
+        lens._apply_illumination(maps, scene, grid)  # noqa: SLF001
+        for complete in maps:
+            yield partial(rows_of, complete)
+
+    def _write_reference(self, scene: SceneLike, grid: Grid, data: NDArray[Any]) -> None:
+        """Write maps of a scene with depth by rays through points of the pupil."""
+        from foveasim.optics._depth import fine_pixels, reference_map
+
+        if depth_of(scene) is None or self.is_varying or self.lateral_colour is not None:
+            raise ParameterError(
+                "reference",
+                "must be False, except for a scene with depth and a lens whose aberrations are constant over the field",
+                True,
+            )
+        lens, centre = self._focused(scene), (0.0, 0.0)
+        layers = lens._layers(scene)  # noqa: SLF001 -- same class
+        radiance_w_m2 = lens._on_axis_w_m2(scene, scene.spectrum_w_m2_sr_nm, grid)  # noqa: SLF001
+        n_number = lens.working_f_number(scene.distance_m)
+        for band, wave_nm in enumerate(scene.wavelength_nm.tolist()):
+            pixels = np.einsum("byx,b->yx", scene.basis, radiance_w_m2[:, band], dtype=np.float64)
+
+            def shifts_cells(layer: Layer, points: Floats, wave_nm: float = wave_nm) -> Floats:
+                aperture = lens._aperture(layer.distance_m)  # noqa: SLF001
+                assert isinstance(aperture, Aperture)
+                return aperture.ray_slopes(points, wave_nm, centre) * (2.0 * n_number / grid.pitch_x_um)
+
+            def transmittance(points: Floats, wave_nm: float = wave_nm) -> Floats:
+                x, y = points.T
+                every = [np.square(np.abs(pupil(x, y, wave_nm))) for pupil in self._pupils()]
+                return np.asarray(np.prod([np.ones(x.size), *every], axis=0))
+
+            fine = fine_pixels(layers, self._n_fine)
+            image = np.kron(pixels, np.ones((self._n_fine, self._n_fine)))[np.newaxis]
+            data[band] = reference_map(fine, image, shifts_cells, transmittance, self.padding)
+        lens._apply_illumination(data, scene, grid)  # noqa: SLF001
+
+    def _focused(self, scene: SceneLike) -> Optics:
+        """Return the lens with a focus distance, that of the scene by default, and its own cache."""
+        if self.psfs is not None:
+            raise ParameterError(
+                "psfs",
+                "must not be given for a scene with depth, since sampled PSFs do not change with the distance",
+                self.psfs,
+                hint="use 'pupil', 'zernike' or 'seidel', or a scene without depth",
+            )
+        focus_m = scene.distance_m if self.focus_distance_m is None else self.focus_distance_m
+
+        def create() -> Optics:
+            lens = replace(self, focus_distance_m=focus_m)
+            lens._cache.apertures.max_values = lens._cache.modes.max_values = MAX_LAYERS  # noqa: SLF001
+            return lens
+
+        found: Optics = self._cache.focused.get((focus_m, self.oversample), create)
+        return found
+
+    def _layers(self, scene: SceneLike) -> Layers:
+        """Return the layers of a scene with depth, for a lens with a focus distance."""
+        from foveasim.optics._depth import Layers
+
+        depth_m, max_layers = depth_of(scene), getattr(scene, "depth_layers", None)
+        assert depth_m is not None
+        assert self.focus_distance_m is not None
+        focus_m = self.focus_distance_m
+        self._check_distance("depth_m", float(depth_m.min()))
+        view = self._view(scene)
+        cell_um = max(view.grid.pitch_x_um, 0.5 * float(view.lambda_n_um.min()))
+        radius_um = 0.5 * float(um_from_m(m_from_mm(self.focal_length_mm))) / self.f_number
+        blur_cells_m = radius_um * float(m_from_mm(self._image_distance_mm(focus_m))) / cell_um
+        found: Layers = self._cache.layers.get(
+            (id(depth_m), blur_cells_m, focus_m, max_layers),
+            lambda: Layers.of(depth_m, blur_cells_m, focus_m, max_layers),
+            owner=depth_m,
+        )
+        return found
+
+    def _on_axis_w_m2(self, scene: SceneLike, spectrum_w_m2_sr_nm: Floats, grid: Grid) -> Floats:
+        """Return the on-axis irradiance of spectra in each band on the cells of a grid."""
+        aperture = self._aperture(scene.distance_m)
+        transmittance = np.array([aperture.transmittance(float(w)) for w in scene.wavelength_nm])
+        irradiance_w_m2 = (
+            spectrum_w_m2_sr_nm * scene.band_width_nm * transmittance * self.irradiance_per_radiance(scene.distance_m)
+        )
+        pixel_um = grid.pitch_x_um * self._n_fine
+        return irradiance_w_m2 * (_pitch_um(scene) * self._view(scene).magnification / pixel_um) ** 2
+
+    def _apply_illumination(self, maps: NDArray[Any], scene: SceneLike, grid: Grid) -> None:
+        """Multiply maps on the cells of a grid by the relative illumination."""
+        cells = Grid.centred(grid.shape, grid.pitch_x_um, grid.centre_um)
+        illumination = self._illumination(cells, self._aperture(scene.distance_m), scene.distance_m)
+        if illumination is None:
+            x2, y2 = self._squared_tangents(scene, self._n_fine)
+            for row, row_y2 in enumerate(y2):
+                tangent2 = 1.0 + x2 + row_y2
+                falloff = tangent2 * tangent2 if self._falloff_power == 4 else tangent2 ** (0.5 * self._falloff_power)
+                maps[:, row] /= falloff.astype(maps.dtype)
+        for part in illumination or []:
+            maps *= part.at_pixels().astype(maps.dtype)
+
+    @property
+    def _falloff_power(self) -> int:
+        """Exponent of the cosine of the field angle."""
+        return (4 if self.emission == "lambertian" else 3) - (self.pupil_tilt == "turning")
 
     @property
     def n_patches(self) -> tuple[int, int]:
@@ -700,7 +888,14 @@ class Optics(PointImages):
         return (1, 1) if n is None or not self.is_varying else (n, n)
 
     def imaging(
-        self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int = 1
+        self,
+        scene: SceneLike,
+        weights: Floats,
+        *,
+        grid: Grid | None = None,
+        n_threads: int = 1,
+        object_m: float | None = None,
+        layer_part: LayerPart | None = None,
     ) -> tuple[Imaging, Callable[[tuple[float, float]], Tables]]:
         """
         Return the inputs of the computation of maps, for other transforms.
@@ -709,6 +904,10 @@ class Optics(PointImages):
         ----------
         scene, weights, grid, n_threads
             As for :meth:`weighted_maps`.
+        object_m : float, optional, m
+            Distance that determines the defocus, by default that of the scene.
+        layer_part : {"light", "cover"}, optional
+            For a layer of a scene with depth: its light or its cover, without relative illumination.
 
         Returns
         -------
@@ -721,21 +920,21 @@ class Optics(PointImages):
 
         grid = self._refine(self.grid(scene)) if grid is None else grid
         lambda_n_um = self._lambda_n_um(scene)
-        aperture = self._aperture(scene.distance_m)
+        object_m = scene.distance_m if object_m is None else object_m
+        aperture = self._aperture(object_m)
         is_clear_circle = aperture.is_clear_circle
+        defocus_um = 0.0
+        if layer_part is not None and isinstance(aperture, Aperture) and aperture.is_defocused_circle:
+            is_clear_circle, defocus_um = True, aperture.defocus_um
+        # Of the lens, whatever the cells are.
+        blur_um = 4.0 * defocus_um * lambda_n_um / um_from_nm(scene.wavelength_nm)
         pixels = Grid.centred(
             (scene.basis.shape[1], scene.basis.shape[2]), grid.pitch_x_um * self._n_fine, grid.centre_um
         )
         if is_clear_circle:
             lambda_n_um = np.maximum(lambda_n_um, grid.pitch_x_um / MAX_ALIASES)
-        transmittance = np.array([aperture.transmittance(float(w)) for w in scene.wavelength_nm])
-        irradiance_w_m2 = (
-            scene.spectrum_w_m2_sr_nm
-            * scene.band_width_nm
-            * transmittance
-            * self.irradiance_per_radiance(scene.distance_m)
-        )
-        modes = self._field_modes(scene, n_threads) if self._has_modes() else None
+        irradiance_w_m2 = self._on_axis_w_m2(scene, scene.spectrum_w_m2_sr_nm, grid)
+        modes = self._field_modes(scene, n_threads, object_m) if self._has_modes() else None
         if modes is not None:
             # Mode k of image b is an image, and mode k of wavelength λ a wavelength.
             n_modes = modes.n_modes
@@ -744,12 +943,15 @@ class Optics(PointImages):
             )
             weights = np.tile(weights, n_modes)
         tangent2_x, tangent2_y = self._squared_tangents(scene)
-        illumination = self._illumination(pixels, aperture, scene.distance_m)
+        illumination = self._illumination(pixels, aperture, scene.distance_m) if layer_part is None else []
+        basis = scene.basis
+        if illumination is None and scene.projection != "rectilinear":
+            illumination, basis = [], np.multiply(basis, self._law_at_pixels(scene), dtype=self._real_type())
         if illumination is not None:
             tangent2_x, tangent2_y = np.zeros_like(tangent2_x), np.zeros_like(tangent2_y)
         # Cache key: a factor depends on these, the lens and the weights.
         place = None if modes is None else grid
-        spectrum_key = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um, self._n_fine, place
+        spectrum_key = scene.wavelength_nm.tobytes(), object_m, grid.shape, grid.pitch_x_um, self._n_fine, place
 
         def cached_factor(weight: Floats, transform: Transform, table_of: Tables) -> Factor:
             # Factors of a clear circle are real and even.
@@ -763,17 +965,17 @@ class Optics(PointImages):
             return lambda first, last: cached[first:last]
 
         imaging = Imaging(
-            basis=scene.basis,
-            irradiance_w_m2=irradiance_w_m2
-            * (_pitch_um(scene) * self._view(scene).magnification / pixels.pitch_x_um) ** 2,
+            basis=basis,
+            irradiance_w_m2=irradiance_w_m2,
             weights=weights,
             field_weights=[] if modes is None else modes.weights(pixels.shape),
             illumination=illumination or [],
             tangent2_x=tangent2_x,
             tangent2_y=tangent2_y,
-            falloff_power=4 if self.emission == "lambertian" else 3,
+            falloff_power=self._falloff_power,
             grid=pixels,
-            padding=self.padding,
+            # Beyond a picture with zero padding is darkness, which covers what is behind it.
+            padding="edge" if layer_part == "cover" and self.padding == "zero" else self.padding,
             pad=self._reach_cells(scene, pixels, aperture, lambda_n_um, LOST_FRACTION)
             if self.padding_cells is None
             else self.padding_cells,
@@ -788,8 +990,14 @@ class Optics(PointImages):
         )
 
         def tables_at(field_um: tuple[float, float]) -> Tables:
-            if is_clear_circle:
+            if is_clear_circle and defocus_um == 0.0:
                 return RadialTables(1.0 / lambda_n_um, self._real_type())
+            if is_clear_circle:
+                found: RadialTables = self._cache.radial.get(
+                    (scene.wavelength_nm.tobytes(), lambda_n_um.tobytes(), object_m),
+                    lambda: RadialTables(1.0 / lambda_n_um, self._real_type(), blur_um / (4.0 * lambda_n_um)),
+                )
+                return found
 
             points_um, combinations = [field_um], ONE_POINT
             if modes is not None:
@@ -865,14 +1073,15 @@ class Optics(PointImages):
     def _has_modes(self) -> bool:
         return self.is_varying and self.field_patches is None
 
-    def _field_modes(self, scene: SceneLike, n_threads: int) -> FieldModes:
-        """Return the modes of the PSFs over a picture."""
+    def _field_modes(self, scene: SceneLike, n_threads: int, object_m: float | None = None) -> FieldModes:
+        """Return the modes of the PSFs over a picture, with the defocus of a distance."""
         from foveasim.optics._field_modes import find_modes
 
-        grid, aperture = self._refine(self.grid(scene)), self._aperture(scene.distance_m)
+        object_m = scene.distance_m if object_m is None else object_m
+        grid, aperture = self._refine(self.grid(scene)), self._aperture(object_m)
         n_modes = None if self.field_modes == "auto" else self.field_modes
         found: FieldModes = self._cache.modes.get(
-            (scene.wavelength_nm.tobytes(), scene.distance_m, grid),
+            (scene.wavelength_nm.tobytes(), object_m, grid),
             lambda: find_modes(
                 aperture,
                 grid,
@@ -910,13 +1119,22 @@ class Optics(PointImages):
     # -- parts ----------------------------------------------------------------------------------------------------
 
     def _pupils(self) -> tuple[Pupil, ...]:
+        half = () if self.pupil_part == "full" else (Half(self.pupil_part),)
         if self.pupil is None:
-            return ()
-        return tuple(self.pupil) if isinstance(self.pupil, Sequence) else (self.pupil,)
+            return half
+        return (*(self.pupil if isinstance(self.pupil, Sequence) else (self.pupil,)), *half)
 
     def aperture(self, scene: SceneLike) -> PSFModel:
         """Return the aperture, or the sampled PSFs, for the distance of a scene."""
         return self._aperture(scene.distance_m)
+
+    def _extreme_apertures(self, scene: SceneLike) -> list[PSFModel]:
+        """Return the aperture for a scene, or for the nearest and the farthest point of its depth."""
+        depths_m = _depth_range_m(scene)
+        if depths_m is None:
+            return [self._aperture(scene.distance_m)]
+        lens = self._focused(scene)
+        return [lens._aperture(lens._check_distance("depth_m", each_m)) for each_m in depths_m]  # noqa: SLF001
 
     def _aperture(self, distance_m: float) -> PSFModel:
         psfs = self.psfs
@@ -1031,10 +1249,27 @@ class Optics(PointImages):
             )
         return np.asarray(values)
 
-    def _squared_tangents(self, scene: SceneLike) -> tuple[Floats, Floats]:
-        """Return (x0/H)² of the scene columns and (y0/H)² of the scene rows."""
-        _, n_y, n_x = scene.basis.shape
-        step, x, y = (float(m_from_um(each)) / scene.distance_m for each in (_pitch_um(scene), *scene.centre_um))
+    def _law_at_pixels(self, scene: SceneLike) -> Floats:
+        """
+        Return the relative illumination of an image that is not rectilinear, (n_y, n_x).
+
+        The projected area of the pupil relative to that on the axis, times the solid angle per area of the image.
+        """
+        self._require_lambertian(scene.projection)
+        grid, distance_m = self.grid(scene), scene.distance_m
+        focal_um = float(um_from_m(m_from_mm(self._image_distance_mm(distance_m))))
+        found: Floats = self._cache.illumination.get(
+            (grid, distance_m, scene.projection),
+            lambda: solid_angles_sr(grid, focal_um, scene.projection, is_flat=self.pupil_tilt == "flat"),
+        )
+        return found
+
+    def _squared_tangents(self, scene: SceneLike, n_fine: int = 1) -> tuple[Floats, Floats]:
+        """Return (x0/H)² of the scene columns and (y0/H)² of the scene rows, or of their cells."""
+        n_y, n_x = (n_fine * n for n in scene.basis.shape[1:])
+        step, x, y = (
+            float(m_from_um(each)) / scene.distance_m for each in (_pitch_um(scene) / n_fine, *scene.centre_um)
+        )
         return ((np.arange(n_x) - 0.5 * (n_x - 1)) * step + x) ** 2, (
             (np.arange(n_y) - 0.5 * (n_y - 1)) * step + y
         ) ** 2

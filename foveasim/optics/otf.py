@@ -23,6 +23,10 @@ MAX_ALIASES = 128
 #: Points of a radial table up to the smallest cut-off; the float32 table fits the L1 cache. The error of linear interpolation
 #: is at most 2.4e-7 of the value at zero frequency in float32 and 3.0e-8 in float64, near the cut-off.
 TABLE_POINTS: dict[Any, int] = {np.float32: 1 << 13, np.float64: 1 << 15}
+#: Waves of defocus of such a table; more defocus requires more points.
+WAVES_PER_TABLE = 4.0
+#: Points of such a table between those at which the OTF is computed.
+SPLINE_STEP = 16
 #: The OTF at one point of the field.
 ONE_POINT = np.ones((1, 1))
 #: Largest number of points of the field whose OTFs are added together.
@@ -33,6 +37,10 @@ SUMS_TOGETHER = 16
 MAX_CACHED_APERTURES = 4
 #: Largest number of cached geometries of scenes.
 MAX_CACHED_VIEWS = 16
+#: Largest number of cached scenes with depth.
+MAX_CACHED_LAYERS = 2
+#: Largest number of cached tables of their layers.
+MAX_CACHED_RADIAL = 64
 #: Memory limit of the tables of all wavelengths, in numbers (128 MiB); beyond it, their step increases.
 MAX_TABLE_SIZE = 1 << 24
 #: Memory limit of the tables cached per lens, in complex numbers (512 MiB in single precision).
@@ -72,6 +80,40 @@ def circular_otf(s: ArrayLike) -> Floats:
     return np.asarray((2.0 / np.pi) * (np.arccos(ratio) - ratio * np.sqrt(1.0 - ratio * ratio)))
 
 
+def defocused_otf(s: ArrayLike, waves: float) -> Floats:
+    """
+    Compute the optical transfer function of a defocused clear circular pupil.
+
+    Parameters
+    ----------
+    s : array
+        As for :func:`circular_otf`.
+    waves : float
+        Path difference at the edge of the pupil, in wavelengths.
+
+    Returns
+    -------
+    otf : array of the same shape, float64
+        Real, since the pupil is symmetric.
+
+    Notes
+    -----
+    H. H. Hopkins, The frequency response of a defocused optical system, Proc. R. Soc. A 231, 91 (1955). Two pupils that are
+    displaced by ±s overlap in a lens, in which the phase difference is ``8π w s x``: the OTF is
+    ``(4/π) ∫ cos(8π w s x) sqrt(1 - (x + s)²) dx`` from 0 to 1 - s, here by Gauss-Legendre quadrature over asin(x + s).
+    """
+    ratio: Floats = np.minimum(np.abs(as_numbers("s", s)), 1.0)
+    highest = 2.0 * np.pi * abs(waves)  # largest phase in the overlap
+    nodes, weights = np.polynomial.legendre.leggauss(24 + math.ceil(0.75 * highest))
+    first = np.arcsin(ratio)
+    half = 0.5 * (0.5 * np.pi - first)
+    total = np.zeros(ratio.shape)
+    for node, weight in zip(nodes, weights, strict=True):
+        angle = first + half * (1.0 + node)
+        total += weight * np.cos(8.0 * np.pi * waves * ratio * (np.sin(angle) - ratio)) * np.cos(angle) ** 2
+    return np.asarray((4.0 / np.pi) * half * total)
+
+
 class Tables(Protocol):
     """Tables of weighted sums of OTFs, for :class:`foveasim.optics._transform.Transform`."""
 
@@ -80,12 +122,17 @@ class Tables(Protocol):
 
 
 class RadialTables:
-    """OTF tables of a clear circle in focus, over ``|f|`` up to the highest cut-off."""
+    """
+    OTF tables of a clear circle, over ``|f|`` up to the highest cut-off.
 
-    def __init__(self, cutoff_per_um: Floats, real: type[np.floating[Any]]) -> None:
+    ``waves`` (n_wavelength,): defocus at the edge of the pupil, in wavelengths; None in focus.
+    """
+
+    def __init__(self, cutoff_per_um: Floats, real: type[np.floating[Any]], waves: Floats | None = None) -> None:
         f_max_per_um = float(cutoff_per_um.max())
-        self._real = real
+        self._real, self._waves = real, np.zeros(cutoff_per_um.size) if waves is None else waves
         n_wanted = TABLE_POINTS[real] * float(f_max_per_um / cutoff_per_um.min())
+        n_wanted *= max(1.0, float(np.abs(self._waves).max()) / WAVES_PER_TABLE)
         n_points = max(TABLE_POINTS[real], int(min(n_wanted, MAX_TABLE_SIZE / cutoff_per_um.size)))
         self._f_per_um, self._cutoff_per_um = np.linspace(0.0, f_max_per_um, n_points), cutoff_per_um
         self._per_step = (n_points - 1) / f_max_per_um
@@ -93,7 +140,8 @@ class RadialTables:
 
     def _otf(self, k: int) -> Floats:
         if k not in self._otfs:
-            self._otfs[k] = circular_otf(self._f_per_um / self._cutoff_per_um[k])
+            ratio, waves = self._f_per_um / self._cutoff_per_um[k], float(self._waves[k])
+            self._otfs[k] = circular_otf(ratio) if waves == 0.0 else _interpolated_otf(ratio, waves)
         return self._otfs[k]
 
     def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
@@ -102,6 +150,14 @@ class RadialTables:
         for k in np.flatnonzero(weight):
             total += weight[k] * self._otf(int(k))
         return total.astype(self._real), self._per_step
+
+
+def _interpolated_otf(ratio: Floats, waves: float) -> Floats:
+    """Return the OTF with defocus at equidistant frequencies, by a cubic spline, within 1e-5."""
+    from scipy.interpolate import CubicSpline
+
+    within = np.linspace(0.0, 1.0, max(ratio.size // SPLINE_STEP, 2))
+    return np.asarray(CubicSpline(within, defocused_otf(within, waves))(np.minimum(ratio, 1.0)))
 
 
 class PlaneTables:
@@ -244,6 +300,9 @@ class TableCache:
         self.modes = BoundedCache(MAX_CACHED_APERTURES)
         self.illumination = BoundedCache(MAX_CACHED_APERTURES)
         self.views = BoundedCache(MAX_CACHED_VIEWS)
+        #: Of scenes with depth: tables of layers, layers, and lenses with a focus, each with its own cache.
+        self.radial = BoundedCache(MAX_CACHED_RADIAL)
+        self.layers, self.focused = BoundedCache(MAX_CACHED_LAYERS), BoundedCache(MAX_CACHED_LAYERS)
 
     def __reduce__(self) -> tuple[type[TableCache], tuple[()]]:
         return TableCache, ()

@@ -301,6 +301,23 @@ class PupilImage:
         return PupilEdges(lines_x=lines, lines_y=lines)
 
 
+@dataclass(frozen=True, slots=True)
+class Half:
+    """Half of the pupil behind one photodiode of a dual pixel, on one side of the y axis."""
+
+    side: Literal["left", "right"]
+
+    def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Floats:  # noqa: ARG002
+        """Return the amplitudes at points of the aperture; points on the axis belong to both."""
+        x, y = as_broadcast(x=x, y=y)
+        inward = x if self.side == "left" else -x
+        return np.where(inward < 0.0, 1.0, np.where(inward == 0.0, np.sqrt(0.5), 0.0)) * np.ones(y.shape)
+
+    def edges(self) -> PupilEdges:
+        """Return the y axis."""
+        return PupilEdges(segments=np.array([[(0.0, -LONG), (0.0, LONG)]]))
+
+
 def _rotated(segments: Floats, angle_deg: float) -> Floats:
     """Return segments (n, 2, 2) rotated counter-clockwise."""
     cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))

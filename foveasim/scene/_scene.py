@@ -1,4 +1,4 @@
-"""Scene: spectral radiance of a plane in front of the lens."""
+"""Scene: spectral radiance of a plane in front of the lens, or by direction."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim._core.calls import Limits, OwnCheck, check_declared
+from foveasim._core.calls import POSITIVE, Limits, OwnCheck, check_declared
 from foveasim._core.show import ViewMethod, view_method
+from foveasim._core.threads import cached_property
 from foveasim._core.validation import (
     MAX_WAVELENGTH_NM,
     Floats,
@@ -35,10 +36,13 @@ from foveasim._io.encodings import FileEncoding, decode
 from foveasim._io.formats import as_file_error
 from foveasim._io.images import EncodedPicture, as_encoded, write_picture
 from foveasim._io.mapped_files import check_unchanged, value_range
+from foveasim._projections import ImageProjection
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.fields import from_file_rows
 from foveasim.scene._colorimetry import LUMINANCE_WEIGHTS
+from foveasim.scene._depth import DepthFormat, Missing, check_depth, read_depth
 from foveasim.scene._illuminants import Illuminant
+from foveasim.scene._panorama import CELLS, TURN, Mapping, Panorama
 from foveasim.scene._photometry import level_of_white, luminance_of
 from foveasim.scene.cubes import (
     IlluminantTable,
@@ -73,11 +77,17 @@ GREY_BAND_WIDTH_NM = 100.0
 MAX_ENCODED = 16.0
 #: Larger values are errors of units: 1e9 m is the distance and width of an astronomical scene.
 PITCH, DISTANCE = Limits(above=0.0, at_most=1e15), Limits(above=0.0, at_most=1e9)
+#: Distance of panoramas, m.
+FAR_M = 1e6
 #: Tolerance of a pitch that is given together with the field of view: rounding errors.
 PITCH_ROUNDING = 1e-9
 #: Spectral radiance above that of any source, W/(m² sr nm); that of the sun is about 2e4.
 MAX_RADIANCE = 1e24
 RADIANCE = Limits(at_least=0.0, at_most=MAX_RADIANCE)
+#: Distance of the value 1 in files of distances, m.
+DEPTH_SCALE = Limits(above=0.0, at_most=1e9)
+#: Layers of a scene with depth.
+LAYERS = Limits(at_least=1, at_most=256)
 #: Characters of the source in the representation.
 MAX_SOURCE = 100
 
@@ -100,7 +110,8 @@ class Scene:
     """
     Spectral radiance of a plane at a given distance in front of the lens.
 
-    Usually created by :meth:`from_picture`, :meth:`from_cube`, :meth:`from_display`, :meth:`flat` or :meth:`point_sources`.
+    Usually created by :meth:`from_picture`, :meth:`from_panorama`, :meth:`from_cube`, :meth:`from_display`, :meth:`flat` or
+    :meth:`point_sources`.
 
     Parameters
     ----------
@@ -141,6 +152,17 @@ class Scene:
         With ``fit``, where the optical axis meets the sensor; :meth:`foveasim.Camera.fit_scene` sets it with the pitch.
     display : Display, optional
         Display that shows the picture, as the frames of a video with this scene as template: :meth:`from_display`.
+    projection : {"rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"}
+        Projection of the picture: ``"rectilinear"`` is a plane in front of the lens. In others, the pixel at the distance r
+        from the axis has the direction θ with ``r = distance ρ(θ)``, with the image height ρ of :class:`foveasim.Optics`.
+    panorama : Panorama, optional
+        Directions of the pixels of a picture that is not a plane, with ``fit="cover"``: see :meth:`from_panorama`. A camera
+        computes the image in its projection, with ``panorama=None``.
+    depth_m : (n_y, n_x) float64, optional, m
+        Distance of each pixel along the optical axis, bottom row first, instead of ``distance_m`` for all; infinity is allowed.
+        See :meth:`from_rgbd`.
+    depth_layers : int, optional
+        Largest number of layers of a scene with depth.
 
     Raises
     ------
@@ -183,6 +205,10 @@ class Scene:
     is_rgb: bool = field(default=False, kw_only=True)
     axis_um: tuple[float, float] | None = field(default=None, kw_only=True)
     display: Display | None = field(default=None, kw_only=True)
+    projection: ImageProjection = field(default="rectilinear", kw_only=True)
+    panorama: Panorama | None = field(default=None, kw_only=True)
+    depth_m: Floats | None = field(default=None, kw_only=True)
+    depth_layers: Annotated[int | None, LAYERS] = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         check_declared(self)
@@ -228,6 +254,10 @@ class Scene:
             object.__setattr__(self, "illuminant", frozen_array(illuminant))
         if self.is_rgb and basis.shape[0] != len(RGB_NM):
             raise ParameterError("is_rgb", f"requires three basis images, got {basis.shape[0]}")
+        if self.depth_m is not None:
+            object.__setattr__(self, "depth_m", frozen_array(check_depth(self.depth_m, basis.shape[1:])))
+        elif self.depth_layers is not None:
+            raise ParameterError("depth_layers", "requires 'depth_m'", self.depth_layers)
         object.__setattr__(self, "pitch_um", self._checked_pitch_um())
         object.__setattr__(self, "centre_um", check_point("centre_um", self.centre_um))
         object.__setattr__(self, "gaze_range_um", check_point("gaze_range_um", self.gaze_range_um, at_least=0.0))
@@ -237,6 +267,10 @@ class Scene:
             if self.fit is None:
                 raise ParameterError("axis_um", "requires 'fit'", self.axis_um, "µm")
             object.__setattr__(self, "axis_um", check_point("axis_um", self.axis_um))
+        if self.panorama is not None:
+            if self.fit != "cover":
+                raise ParameterError("panorama", "requires fit='cover'", self.fit)
+            self.panorama.check_shape(basis.shape[1:])
         if any(self.gaze_range_um) and self.fit != "cover":
             raise ParameterError("gaze_range_um", "requires fit='cover'", self.gaze_range_um, "µm")
 
@@ -271,6 +305,11 @@ class Scene:
         weights = luminance_of(self.spectrum_w_m2_sr_nm, self.wavelength_nm, self.band_width_nm)
         return np.asarray(np.tensordot(weights, self.basis, axes=1))
 
+    @cached_property
+    def depth_range_m(self) -> tuple[float, float] | None:
+        """Smallest and largest distance of the pixels, m; None without depth."""
+        return None if self.depth_m is None else (float(self.depth_m.min()), float(self.depth_m.max()))
+
     def with_pitch(self, pitch_um: float) -> Scene:
         """
         Return the scene with another pixel pitch instead of its pitch, fit or field of view.
@@ -299,6 +338,49 @@ class Scene:
         axis = None if axis_um is None else check_point("axis_um", axis_um)
         return self._with(pitch_um=PITCH.check("pitch_um", pitch_um), axis_um=axis)
 
+    def resampled(
+        self, basis: Images, pitch_um: float, axis_um: tuple[float, float] | None, projection: ImageProjection
+    ) -> Scene:
+        """Return a panorama as the picture of its image, with its pitch and its optical axis."""
+        if not np.isfinite(value_range(basis)).all():
+            raise ParameterError("basis", "must be finite")
+        return self._with(basis=basis, projection=projection, panorama=None).framed(pitch_um, axis_um)
+
+    def turned(
+        self, *, yaw_deg: float | None = None, pitch_deg: float | None = None, roll_deg: float | None = None
+    ) -> Scene:
+        """
+        Return a panorama with another orientation of the camera.
+
+        Parameters
+        ----------
+        yaw_deg, pitch_deg, roll_deg : float, optional, degrees
+            As for :meth:`from_panorama`; by default those of this scene.
+
+        Returns
+        -------
+        Scene
+            Shares the arrays of this scene.
+
+        Raises
+        ------
+        ParameterError
+            If the scene is a plane.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> scene = fs.Scene.from_panorama(np.ones((16, 32)), luminance_cd_m2=100.0)
+        >>> scene.turned(yaw_deg=90.0).panorama.yaw_deg
+        90.0
+        """
+        if self.panorama is None:
+            raise ParameterError("scene", "must be a panorama, which Scene.from_panorama creates, got a plane")
+        angles = {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg}
+        given: dict[str, Any] = {name: value for name, value in angles.items() if value is not None}
+        return self._with(panorama=replace(self.panorama, **given))
+
     def with_centre(self, centre_um: tuple[float, float]) -> Scene:
         """
         Return the scene at another position.
@@ -324,9 +406,16 @@ class Scene:
 
     def __repr__(self) -> str:
         n_basis, n_y, n_x = vars(self)["basis"].shape
+        if self.panorama is not None:
+            return (
+                f"Scene({self.panorama.mapping} panorama of {n_x} x {n_y} pixels, {n_basis} basis images, "
+                f"{self.wavelength_nm.size} wavelengths, from {printable(self.source)[:MAX_SOURCE]})"
+            )
         size = f", fit='{self.fit}'," if self.pitch_um is None else f" of {self.pitch_um:g} µm"
+        depths_m = self.depth_range_m
+        depth = "" if depths_m is None else f", depth {depths_m[0]:g} to {depths_m[1]:g} m"
         return (
-            f"Scene({n_x} x {n_y} pixels{size} at {self.distance_m:g} m, {n_basis} basis images, "
+            f"Scene({n_x} x {n_y} pixels{size} at {self.distance_m:g} m{depth}, {n_basis} basis images, "
             f"{self.wavelength_nm.size} wavelengths, from {printable(self.source)[:MAX_SOURCE]})"
         )
 
@@ -497,6 +586,226 @@ class Scene:
             is_picture=True,
             is_rgb=colours.shape[0] == len(RGB_NM),
         )
+
+    @classmethod
+    def from_panorama(
+        cls,
+        picture: OwnCheck[str | Path | ArrayLike],
+        *,
+        mapping: Mapping = "equirectangular",
+        yaw_deg: Annotated[float, TURN] = 0.0,
+        pitch_deg: Annotated[float, TURN] = 0.0,
+        roll_deg: Annotated[float, TURN] = 0.0,
+        cells: Annotated[int | Literal["auto"], CELLS] = "auto",
+        lens: OwnCheck[Any] = None,
+        pixel_um: Annotated[float | None, POSITIVE] = None,
+        gaze_range_um: tuple[float, float] = (0.0, 0.0),
+        distance_m: float = FAR_M,
+        peak_radiance_w_m2_sr_nm: float | None = None,
+        luminance_cd_m2: float | None = None,
+        illuminance_lux: float | None = None,
+        reflectance: float = 1.0,
+        wavelength_nm: Sequence[float] | None = None,
+        band_width_nm: float | Sequence[float] | None = None,
+        spectrum: Sequence[Sequence[float]] | Floats | None = None,
+        encoding: FileEncoding = "auto",
+        channels: Literal["rgb", "bgr"] = "rgb",
+    ) -> Scene:
+        """
+        Create a scene from a panorama: radiance by direction, for lenses with any field.
+
+        Parameters
+        ----------
+        picture : path, image of Pillow, or (n_y, n_x) or (n_y, n_x, n_channel) array
+            As for :meth:`from_picture`.
+        mapping : {"equirectangular", "cubemap", "fisheye"}
+            ``"equirectangular"``: 360° by 180°, the zenith in the top row, the direction straight ahead in the centre.
+            ``"cubemap"``: a horizontal cross of 4 x 3 square faces: left, front, right and back from left to right in the
+            middle row, top and bottom above and below the front. ``"fisheye"``: a photograph by a lens with a calibration; it
+            is dark outside the photograph, and its relative illumination is not corrected.
+        yaw_deg, pitch_deg, roll_deg : float, degrees
+            Orientation of the camera: it turns to the right, then upwards, then clockwise about its axis.
+        cells : "auto" or int
+            Number of cells along the longer side of the image that a camera computes. ``"auto"``: two per pixel of the panorama
+            on the axis, at least 64 and at most 2048.
+        lens : lens model of foveasim.distortion, optional
+            For a fisheye photograph, its lens; the origin is the centre of the photograph.
+        pixel_um : float, optional, µm
+            For a fisheye photograph, the pixel size in its calibration.
+        gaze_range_um : (x, y), µm
+            Range of gazes for which the image covers the layout: see the class.
+        distance_m : float, m
+            Distance of the scene, for the focus of the lens.
+        peak_radiance_w_m2_sr_nm, luminance_cd_m2, illuminance_lux, reflectance
+            As for :meth:`from_picture`.
+        wavelength_nm, band_width_nm, spectrum, encoding, channels
+            As for :meth:`from_picture`.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read.
+        ParameterError
+            As for :meth:`from_picture`, or if the picture does not have the shape of the mapping.
+
+        Notes
+        -----
+        A camera computes the image once per orientation: the mean radiance over the solid angle of each cell, from fractions
+        of pixels, so that small features are not lost, and the poles are not sampled at single points.
+
+        Examples
+        --------
+        An ideal fisheye lens with a field of 185 degrees:
+
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> sky = np.repeat([1.0, 0.2], 32)[:, np.newaxis] * np.ones(
+        ...     128
+        ... )  # bright above the horizon
+        >>> scene = fs.Scene.from_panorama(sky, luminance_cd_m2=1000.0, encoding="linear")
+        >>> lens = fs.distortion.Fisheye(projection="equidistant", focal_um=1000.0)
+        >>> camera = fs.Camera(
+        ...     optics=fs.Optics(focal_length_mm=1.0, f_number=2.8),
+        ...     sensor=fs.Sensor(fs.layout.grid(n_x=2, n_y=3, pitch_um=1000.0)),
+        ...     distortion=lens,
+        ... )
+        >>> rates = camera.photoelectrons_per_s(scene)
+        >>> camera.projection(scene), (rates / rates.max()).round(2).tolist()
+        ('equidistant', [0.2, 0.2, 0.71, 0.71, 1.0, 1.0])
+        """
+        panorama = Panorama(
+            mapping=mapping,
+            yaw_deg=yaw_deg,
+            pitch_deg=pitch_deg,
+            roll_deg=roll_deg,
+            cells=cells,
+            lens=lens,
+            pixel_um=pixel_um,
+        )
+        scene = cls.from_picture(
+            picture,
+            fit="cover",
+            gaze_range_um=gaze_range_um,
+            distance_m=distance_m,
+            peak_radiance_w_m2_sr_nm=peak_radiance_w_m2_sr_nm,
+            luminance_cd_m2=luminance_cd_m2,
+            illuminance_lux=illuminance_lux,
+            reflectance=reflectance,
+            wavelength_nm=wavelength_nm,
+            band_width_nm=band_width_nm,
+            spectrum=spectrum,
+            encoding=encoding,
+            channels=channels,
+        )
+        return replace(scene, panorama=panorama)
+
+    @classmethod
+    def from_rgbd(
+        cls,
+        picture: OwnCheck[str | Path | ArrayLike],
+        depth_m: OwnCheck[str | Path | ArrayLike],
+        *,
+        distance_m: float,
+        depth_scale: Annotated[float | None, DEPTH_SCALE] = None,
+        depth_format: DepthFormat | None = None,
+        calibration: str | Path | None = None,
+        missing: Missing = "raise",
+        depth_layers: Annotated[int | None, LAYERS] = None,
+        pitch_um: float | None = None,
+        fit: Fit | None = None,
+        gaze_range_um: tuple[float, float] = (0.0, 0.0),
+        field_of_view_deg: float | None = None,
+        peak_radiance_w_m2_sr_nm: float | None = None,
+        luminance_cd_m2: float | None = None,
+        illuminance_lux: float | None = None,
+        reflectance: float = 1.0,
+        wavelength_nm: Sequence[float] | None = None,
+        band_width_nm: float | Sequence[float] | None = None,
+        spectrum: Sequence[Sequence[float]] | Floats | None = None,
+        encoding: FileEncoding = "auto",
+        channels: Literal["rgb", "bgr"] = "rgb",
+    ) -> Scene:
+        """
+        Create a scene from a photograph and the distance of each of its pixels.
+
+        Parameters
+        ----------
+        picture : path, image of Pillow, or array
+            Photograph that is sharp at all distances, as for :meth:`from_picture`.
+        depth_m : (n_y, n_x) array, or path
+            Distance of each pixel along the optical axis, in m, top row first, of the size of the picture. Infinity is the
+            background at infinity. Files: the channel Z of EXR, 16-bit PNG or TIFF, PFM, or numpy; their unit is
+            ``depth_scale`` or ``depth_format``.
+        distance_m : float, m
+            Distance of the plane in which ``pitch_um`` holds, and which is in focus unless the lens has a focus distance. A
+            pixel is a direction, that of its chief ray, so that the scale of the image does not depend on the depth.
+        depth_scale : float, optional, m
+            Distance of the value 1 in ``depth_m``, such as 0.001 for millimetres; 1 for arrays by default.
+        depth_format : {"mm", "nyu", "nyu_raw", "tum", "middlebury"}, optional
+            Convention of the values instead of a scale: millimetres in integers, as in pictures of the depth of NYU Depth v2
+            (``"nyu"``); raw values d of that set, ``351.3 / (1092.5 - d)`` m; 5000 per metre (TUM); disparities d of Middlebury
+            2014, ``baseline f / (d + doffs)``.
+        calibration : path, optional
+            File ``calib.txt`` of the disparities of Middlebury.
+        missing : {"raise", "far", "nearest"}
+            What pixels with the value 0 or NaN, and unknown disparities, mean: an error, infinity, or the distance of the
+            nearest pixel that has one.
+        depth_layers : int, optional
+            Largest number of layers. By default the blur radii of adjacent layers differ by one pixel or λN/2.
+        pitch_um, fit, gaze_range_um, field_of_view_deg, peak_radiance_w_m2_sr_nm, luminance_cd_m2, illuminance_lux, reflectance
+            As for :meth:`from_picture`.
+        wavelength_nm, band_width_nm, spectrum, encoding, channels
+            As for :meth:`from_picture`.
+
+        Raises
+        ------
+        FileError
+            If a file cannot be read, or does not state the unit of its distances.
+        ParameterError
+            If shapes differ, a distance is negative or missing, or an argument is out of range, as for :meth:`from_picture`.
+
+        Notes
+        -----
+        The lens blurs a point at the distance H over a disc of the radius ``a D |1/H - 1/H_focus|``, with the pupil radius a
+        and the image distance D, in addition to diffraction and aberrations. Near objects cover far ones; what they hide is
+        the far surface at their rim, continued.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> import numpy as np
+        >>> depth_m = np.where(np.arange(64) < 32, 0.5, 2.0) * np.ones((48, 1))
+        >>> scene = fs.Scene.from_rgbd(
+        ...     np.ones((48, 64)),
+        ...     depth_m,
+        ...     distance_m=2.0,
+        ...     pitch_um=500.0,
+        ...     illuminance_lux=500.0,
+        ... )
+        >>> scene.depth_range_m
+        (0.5, 2.0)
+        """
+        distances_m = read_depth(
+            depth_m, depth_scale=depth_scale, depth_format=depth_format, calibration=calibration, missing=missing
+        )
+        plane = cls.from_picture(
+            picture,
+            pitch_um=pitch_um,
+            fit=fit,
+            gaze_range_um=gaze_range_um,
+            field_of_view_deg=field_of_view_deg,
+            distance_m=distance_m,
+            peak_radiance_w_m2_sr_nm=peak_radiance_w_m2_sr_nm,
+            luminance_cd_m2=luminance_cd_m2,
+            illuminance_lux=illuminance_lux,
+            reflectance=reflectance,
+            wavelength_nm=wavelength_nm,
+            band_width_nm=band_width_nm,
+            spectrum=spectrum,
+            encoding=encoding,
+            channels=channels,
+        )
+        return replace(plane, depth_m=distances_m, depth_layers=depth_layers)
 
     @classmethod
     def from_cube(
@@ -960,6 +1269,13 @@ def _example_picture(directory: Path) -> dict[str, Any]:
     return {"picture": str(path), "peak_radiance_w_m2_sr_nm": 0.02, **_BAND, **_GEOMETRY}
 
 
+def _example_rgbd(directory: Path) -> dict[str, Any]:
+    """Write a picture, and its distances in millimetres."""
+    path = directory / "depth.png"
+    write_picture(path, np.array([[1000, 1000, 900], [1000, 1000, 900], [1000, 1000, 900]], np.uint16))
+    return {**_example_picture(directory), "depth_m": str(path), "depth_format": "mm"}
+
+
 def _example_cube(directory: Path) -> dict[str, Any]:
     """Write an ENVI cube of two bands."""
     np.array([[[3, 0, 0], [3, 3, 0]]] * 2, "<f4").tofile(directory / "cube.img")
@@ -973,7 +1289,16 @@ def _example_on_display(directory: Path) -> dict[str, Any]:
     return {"picture": _example_picture(directory)["picture"], "display": "lcd", "distance_m": 1.0}
 
 
+def _example_panorama(directory: Path) -> dict[str, Any]:
+    """Write a panorama that is bright at the upper left and the lower right."""
+    path = directory / "panorama.png"
+    write_picture(path, np.array([[255, 0, 0, 0], [0, 0, 255, 255]], np.uint8))
+    return {"picture": str(path), "peak_radiance_w_m2_sr_nm": 0.02, "yaw_deg": 20.0, **_BAND}
+
+
 SCENES.register("picture", Scene.from_picture, example=_example_picture, expected=("#..", "#..", "##."))
+SCENES.register("panorama", Scene.from_panorama, example=_example_panorama, expected=("#...", "..##"))
+SCENES.register("rgbd", Scene.from_rgbd, example=_example_rgbd, expected=("#..", "#..", "##."))
 _FLAT = {**_GEOMETRY, **_BAND, "shape": (4, 6), "radiance_w_m2_sr_nm": 0.02}
 SCENES.register("flat", Scene.flat, example=_FLAT, expected=("##", "##"))
 SCENES.register(

@@ -194,4 +194,7 @@ def _reduced(scene: Scene, block: int) -> Scene:
     y0, x0 = ((n - used) // 2 for n, used in zip(scene.basis.shape[1:], (n_y, n_x), strict=True))
     basis = np.stack([block_means(in_memory(image[y0 : y0 + n_y, x0 : x0 + n_x]), block) for image in scene.basis])
     pitch_um = None if scene.pitch_um is None or scene.field_of_view_deg is not None else scene.pitch_um * block
-    return replace(scene, basis=basis, pitch_um=pitch_um)
+    depth_m = scene.depth_m
+    if depth_m is not None:  # of the pixel in the middle: means would be distances between objects
+        depth_m = depth_m[y0 : y0 + n_y, x0 : x0 + n_x][block // 2 :: block, block // 2 :: block]
+    return replace(scene, basis=basis, pitch_um=pitch_um, depth_m=depth_m)

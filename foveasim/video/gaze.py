@@ -428,7 +428,9 @@ def pan_camera(
 
 def _crop(scene: Scene, left: int, bottom: int, n_y: int, n_x: int) -> Scene:
     """Return a part of a scene, with its pitch or its framing."""
-    return replace(scene, basis=scene.basis[:, bottom : bottom + n_y, left : left + n_x], field_of_view_deg=None)
+    part = slice(bottom, bottom + n_y), slice(left, left + n_x)
+    depth_m = None if scene.depth_m is None else scene.depth_m[part]
+    return replace(scene, basis=scene.basis[:, *part], depth_m=depth_m, field_of_view_deg=None)
 
 
 def _parts(

@@ -71,6 +71,7 @@ COMPANIONS = {
     "max_density": {"density_window_um": 10.0},
     "max_data_rate_gbit_per_s": {"readout": fs.layout.Readout(frames_per_s=30.0, bits=8)},
     "max_track_utilisation": {"routing": fs.layout.Routing(width_um=1.0, space_um=1.0)},
+    "depth_layers": {"depth_m": np.ones((2, 2))},
     "line_s": {"layout": LAYOUT.with_columns(readout_order=np.arange(16))},
 }
 #: Valid values that other parameters exclude: a pedestal of V_sat.

@@ -392,6 +392,14 @@ CALLS = {
     "Scene.from_display": lambda o: fs.Scene.from_display(
         o.photos / "cats" / "0.png", "oled", distance_m=0.5, subpixels=True
     ).on_display(o.photos / "cats" / "1.png"),
+    "Scene.from_panorama": lambda o: o.camera.projection(
+        fs.Scene.from_panorama(np.ones((8, 16)), luminance_cd_m2=10.0).turned(yaw_deg=20.0)
+    ),
+    "Scene.from_rgbd": lambda o: fs.Optics(focal_length_mm=8.0, f_number=2.8).power_map(
+        fs.Scene.from_rgbd(
+            np.ones((8, 8)), np.full((8, 8), 1.0), pitch_um=100.0, distance_m=0.5, peak_radiance_w_m2_sr_nm=0.05
+        )
+    ),
     "Camera.video": lambda o: list(o.camera.video([o.scene] * 2, exposure_s=0.01, seed=0)),
     "Camera.noise_budget": lambda o: o.camera.noise_budget(o.scene, exposure_s=0.01).plot(),
     "Camera.compare_with": lambda o: o.twins,

@@ -512,6 +512,10 @@ class Dataset:
             return found
         camera = shot.camera
         assert isinstance(shot.scene, Scene)
+        if shot.scene.panorama is not None:
+            raise ParameterError(
+                "scene", "must be a plane for labels in its pixels, got a panorama; omit boxes, masks and flows"
+            )
         scene = camera.fit_scene(shot.scene)
         grid = camera.image_grid(scene)
         lens = camera.distortion

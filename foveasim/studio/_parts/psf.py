@@ -30,6 +30,7 @@ def psf(result: Simulated) -> PartData:
     if not isinstance(source, Scene):
         return {"curves": [], "note": "A power map contains the point spread of its lens."}, {}
     scene, frame = camera.light_at_gaze(source), camera.sensor_frame(source)
+    lens = camera.lens_for(scene)
     points_um = camera.layout.centroid_um + np.array(camera.position_um)
     height_um = np.hypot(*(points_um - frame.axis_um).T)
     chosen = {"nearest": int(height_um.argmin()), "farthest": int(height_um.argmax())}
@@ -40,8 +41,8 @@ def psf(result: Simulated) -> PartData:
     curves, x, y, notes = [], [], [], []
     for name, site in chosen.items():
         at_um = points_um[site]
-        if camera.distortion is not None:
-            at_um = camera.distortion.undistort(at_um, outside="mask")
+        if lens is not None:
+            at_um = lens.undistort(at_um, outside="mask")
         field_um = (at_um - frame.axis_um) / frame.scale
         if np.isnan(field_um).any():
             notes.append(f"{name} outside the image circle")

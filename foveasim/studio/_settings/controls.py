@@ -45,7 +45,7 @@ TAGS = ("kind", "generator")
 #: Sections that settings have on the page, also where a file may omit them.
 REQUIRED = ("layout",)
 #: Required parameters that are files without a bundled one, which the page asks for.
-FROM_FILES = ("path", "file")
+FROM_FILES = ("path", "file", "depth_m")
 #: Optional parameters that new sections contain: framing and light of scenes.
 GIVEN = {"fit", "peak_radiance_w_m2_sr_nm", "radiance_w_m2_sr_nm"}
 #: Description of the choice of a generator's unknown.
