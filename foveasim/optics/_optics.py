@@ -777,7 +777,7 @@ class Optics(PointImages):
             return lens._plane_maps(light, weights, grid, n_threads, layer.distance_m, part)  # noqa: SLF001
 
         white = lens._on_axis_w_m2(scene, mean_spectrum(scene)[np.newaxis], grid)[0]  # noqa: SLF001
-        maps = composed_maps(scene, layers, maps_of, weights @ white, grid.shape, self._real_type())
+        maps = composed_maps(scene, layers, maps_of, weights @ white, grid.shape, self._real_type(), n_threads)
         lens._apply_illumination(maps, scene, grid)  # noqa: SLF001
         for complete in maps:
             yield partial(rows_of, complete)
@@ -987,6 +987,7 @@ class Optics(PointImages):
             real=self._real_type(),
             n_threads=n_threads,
             cached_factor=cached_factor,
+            lit_rows=getattr(scene, "lit_rows", None),
         )
 
         def tables_at(field_um: tuple[float, float]) -> Tables:

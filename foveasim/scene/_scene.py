@@ -255,6 +255,8 @@ class Scene:
         if self.is_rgb and basis.shape[0] != len(RGB_NM):
             raise ParameterError("is_rgb", f"requires three basis images, got {basis.shape[0]}")
         if self.depth_m is not None:
+            if self.panorama is not None or self.projection != "rectilinear":
+                raise ParameterError("depth_m", "must not be given for a panorama, but for a picture of a plane")
             object.__setattr__(self, "depth_m", frozen_array(check_depth(self.depth_m, basis.shape[1:])))
         elif self.depth_layers is not None:
             raise ParameterError("depth_layers", "requires 'depth_m'", self.depth_layers)
