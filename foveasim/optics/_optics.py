@@ -819,9 +819,9 @@ class Optics(PointImages):
         if self.psfs is not None:
             raise ParameterError(
                 "psfs",
-                "must not be given for a scene with depth, since sampled PSFs do not change with the distance",
+                "must not be given for a scene with depth: PSFs sampled at one distance do not determine those at others",
                 self.psfs,
-                hint="use 'pupil', 'zernike' or 'seidel', or a scene without depth",
+                hint="pass the Zernike coefficients of the design as 'zernike', since a wavefront can be defocused",
             )
         focus_m = scene.distance_m if self.focus_distance_m is None else self.focus_distance_m
 

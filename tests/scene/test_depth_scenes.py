@@ -58,6 +58,8 @@ def test_missing_distances_are_explicit():
         ("nyu", 1500, 1.5),
         ("tum", 5000, 1.0),  # "a pixel value of 5000 in the depth image corresponds to a distance of 1 meter"
         ("nyu_raw", 800, 1.2010),  # 351.3 / 292.5
+        ("nyu_raw", 1057, 9.8958),
+        ("nyu_raw", 1084, 10.0),  # the limit of the toolbox, camera_params.m
     ],
 )
 def test_conventions_of_integers(tmp_path, convention, stored, expected_m):
@@ -66,6 +68,13 @@ def test_conventions_of_integers(tmp_path, convention, stored, expected_m):
     found = distances_of(str(tmp_path / "depth.png"), shape=(4, 4), depth_format=convention)
 
     np.testing.assert_allclose(found, expected_m, rtol=1e-4)
+
+
+def test_nyu_pictures_agree_with_raw_values():
+    """A raw value of 600 is the nearest that the toolbox keeps, 0.71 m."""
+    raw = distances_of(np.array([[600]]), depth_format="nyu_raw")
+    assert raw[0, 0] == pytest.approx(0.7133, abs=1e-4)
+    assert distances_of(np.array([[713]], np.uint16), depth_format="nyu")[0, 0] == pytest.approx(raw[0, 0], abs=1e-3)
 
 
 def test_raw_value_without_distance_is_missing():
@@ -136,7 +145,8 @@ def test_sampled_psfs_are_refused_with_depth():
     spot = np.exp(-0.5 * np.add.outer(np.arange(-8, 9) ** 2, np.arange(-8, 9) ** 2))
     psfs = fs.optics.PSFGrid.from_arrays(spot, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0)
 
-    with pytest.raises(ParameterError, match="'psfs' must not be given for a scene with depth"):
+    sentence = "'psfs' must not be given for a scene with depth: PSFs sampled .* pass the Zernike coefficients"
+    with pytest.raises(ParameterError, match=sentence):
         camera(psfs=psfs).predict(fs.Scene.from_rgbd(*disc_before_wall(), **LIGHT), exposure_s=0.01)
 
 
