@@ -200,13 +200,13 @@ def main(out: Path) -> None:
     """Write the figures."""
     out.mkdir(parents=True, exist_ok=True)
 
-    # Focus on each object in turn
+    # %% Pictures that are focused on each object in turn.
     figure_of_focus(out)
 
-    # Compare layers with rays through the pupil
+    # %% Layers against rays through the pupil.
     print(f"error of layers: {100.0 * figure_of_errors(out):.2g} % of white (rms)")
 
-    # Do so for random scenes
+    # %% The same for random scenes.
     figure_of_random_scenes(out)
 
 
