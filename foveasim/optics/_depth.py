@@ -31,10 +31,10 @@ from numpy.typing import NDArray
 from foveasim._core.threads import parallel_map
 from foveasim._core.validation import Bools, Floats, Images, Ints
 from foveasim._io.mapped_files import in_memory
+from foveasim._projections import ImageProjection
 from foveasim.optics._imaging import MapRows
 
 if TYPE_CHECKING:
-    from foveasim._projections import ImageProjection
     from foveasim.fields import SceneLike
 
 #: Step of the blur radius between neighbouring pixels, in cells, above which a surface ends behind another one.

@@ -344,6 +344,8 @@ class Scene:
         self, basis: Images, pitch_um: float, axis_um: tuple[float, float] | None, projection: ImageProjection
     ) -> Scene:
         """Return a panorama as the picture of its image, with its pitch and its optical axis."""
+        if not np.isfinite(value_range(basis)).all():
+            raise ParameterError("basis", "must be finite")
         return self._with(basis=basis, projection=projection, panorama=None).framed(pitch_um, axis_um)
 
     def turned(

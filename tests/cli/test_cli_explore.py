@@ -812,7 +812,7 @@ def test_each_picture_has_one_label_file(tmp_path):
         ("sweep", ["foveal.yaml"], {"shot"}),
         ("study", ["best_fovea.yaml"], {"shot", "search", "objectives", "trials"}),
         ("dataset", ["random_cameras.yaml"], {"pictures", "shot"}),
-        ("shot", [], {"scene", "optics", "layout", "exposure_s"}),
+        ("shot", [], {"scene", "optics", "exposure_s"}),
     ],
 )
 def test_schema_has_keys_of_examples(foveasim, kind, examples, needed):
@@ -821,6 +821,8 @@ def test_schema_has_keys_of_examples(foveasim, kind, examples, needed):
 
     assert code == 0
     assert set(schema["required"]) == needed
+    if kind == "shot":  # a twin has a layout
+        assert {tuple(each["required"]) for each in schema["anyOf"]} == {("layout",), ("sensor",)}
     assert schema["additionalProperties"] is False
     for example in examples:
         assert set(yaml.safe_load((GALLERY / example).read_text())) <= set(schema["properties"])

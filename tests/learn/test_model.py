@@ -13,6 +13,7 @@ from torch.func import functional_call
 import foveasim as fs
 from foveasim import learn
 from foveasim.distortion import BrownConrady, Fisheye, Omnidirectional, PolynomialFisheye, Scaramuzza
+from foveasim.errors import ParameterError
 from foveasim.integrate import UndistortedOutlines
 from foveasim.learn.distortion import coefficient_values
 from foveasim.optics import LateralColour, PSFGrid, PupilImage, Seidel, Zernike
@@ -563,3 +564,16 @@ def test_distorted_outlines_agree_with_differences(order):
                 assert abs(slopes[1] - float(points.grad[point, axis])) < 2e-8 * scale
 
     assert n_compared > 100
+
+
+def test_models_refuse_scenes_that_are_not_planes():
+    camera = fs.Camera(
+        optics=fs.Optics(focal_length_mm=1.0, f_number=2.8),
+        sensor=fs.Sensor(fs.layout.grid(n_x=3, n_y=3, pitch_um=4.0)),
+    )
+    panorama = fs.Scene.from_panorama(np.ones((8, 16)), luminance_cd_m2=100.0)
+    size = {"pitch_um": 2000.0, "distance_m": 0.5, "luminance_cd_m2": 100.0}
+    deep = fs.Scene.from_rgbd(np.ones((9, 9)), np.full((9, 9), 0.5), **size)
+    for scene in (panorama, deep):
+        with pytest.raises(ParameterError, match="'scene' must be a plane for"):
+            learn.Model(camera, scene, exposure_s=0.01)

@@ -48,6 +48,13 @@ SCENE_ARGUMENTS: dict[str, dict[str, Any]] = {
     "rgbd": GEOMETRY
     | {"picture": "picture.png", "peak_radiance_w_m2_sr_nm": 0.08, "wavelength_nm": [620.0, 550.0, 450.0]}
     | {"depth_m": "depth.png", "depth_scale": 1e-6},
+    "panorama": {
+        "picture": "panorama.png",
+        "peak_radiance_w_m2_sr_nm": 0.08,
+        "distance_m": DISTANCE_M,
+        "cells": SHAPE[1],
+    }
+    | {"wavelength_nm": [620.0, 550.0, 450.0], "yaw_deg": 20.0},
     "flat": CHART | GREY,
     "point_sources": CHART | POINTS | {"pixels": [[30, 40], [60, 61], [80, 20]], "intensity_w_sr_nm": 1e-4},
     "display": {
@@ -273,6 +280,10 @@ def is_possible(row):
     needs_lines = features.get("fixed") == "column_fpn" or features.get("adc") == "dnl"
     if needs_lines and features.get("layout") in WITHOUT_LINES:
         return False
+    # Points that radiate uniformly are those of a plane; images of panoramas through lens models are not rectilinear.
+    is_isotropic = features.get("scene") == "panorama" and features.get("optics") == "isotropic"
+    if is_isotropic and features.get("distortion") not in (None, "none"):
+        return False
     has_slivers = features.get("edit") in CUTTING_EDITS and features.get("layout") not in (None, "grid")
     # Capacitances in proportion to the area of slivers are below the limit, and couple to those of their neighbours too strongly.
     if has_slivers and features.get("fixed") == "gain_fpn":
@@ -317,6 +328,7 @@ def write_files(directory: Path):
     """Write the files that the settings refer to."""
     rng = np.random.default_rng(0)
     write_picture(directory / "picture.png", rng.integers(0, 256, (*SHAPE, 3), np.uint8))
+    write_picture(directory / "panorama.png", rng.integers(0, 256, (360, 720, 3), np.uint8))
     near = np.hypot(*np.mgrid[-1 : 1 : 1j * SHAPE[0], -1 : 1 : 1j * SHAPE[1]]) < 0.4
     write_picture(directory / "depth.png", np.where(near, 300, int(1e6 * DISTANCE_M)).astype(np.uint16))
     y, x = np.mgrid[-1:1:64j, -1:1:64j]

@@ -242,9 +242,3 @@ def test_settings_file_runs_with_depth(settings):
     assert run.returncode == 0, run.stderr
     shot = fs.config.read_shot(settings)
     assert shot.scene.depth_range_m == (0.5, 2.0)
-
-
-def test_gradients_refuse_depth():
-    pytest.importorskip("torch")
-    with pytest.raises(ParameterError, match="'scene' must be a plane for PyTorch"):
-        fs.learn.SensorLayer(camera(), fs.Scene.from_rgbd(*disc_before_wall(), **LIGHT))

@@ -588,6 +588,26 @@ def test_temperatures_belong_to_all_stacks(stacks):
         fs.twin.fit([warm, *stacks[1:]], bits=12, pixel_um=3.0)
 
 
+@pytest.mark.parametrize(
+    ("shape", "bits", "message"),
+    [
+        ((8, 16, 16), 1, "dark frames below the highest code"),
+        ((8, 1, 16), 12, "at least 4 rows and columns, got 16 x 1"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*of the codes of stack 0 are 0")
+def test_frames_without_statistics_are_explained(shape, bits, message):
+    rng = np.random.default_rng(1)
+
+    def frames(probability):
+        return rng.binomial(2**bits - 1, probability, shape).astype(np.uint16)
+
+    stacks = [fs.twin.Stack(frames(0.1), 0.01, light=0)]
+    stacks += [fs.twin.Stack(frames(0.2 * k), 0.01 * k, light=1) for k in (1, 2, 3, 4)]
+    with pytest.raises(fs.errors.ParameterError, match=message):
+        fs.twin.fit(stacks, bits=bits, pixel_um=3.0)
+
+
 def test_clipped_dark_frames_are_reported():
     stacks = numpy_stacks(0.4, 4.0, 0.3, 8000.0)
     with pytest.warns(fs.errors.FoveasimWarning, match="of the codes of stack 0 are 0"):

@@ -72,8 +72,8 @@ def fit(
     Raises
     ------
     ParameterError
-        When stacks have different sizes, fewer than two frames, or codes above those of ``bits``; without dark frames, or
-        without levels of light.
+        When stacks have different sizes, fewer than two frames, fewer than four rows or columns, or codes above those
+        of ``bits``; without dark frames, or without levels of light.
     FileError
         When a file cannot be read.
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from scipy.special import ndtr
@@ -26,8 +27,8 @@ DIFFERENCES, MAX_SIGMAS = np.array([1.0, -3.0, 3.0, -1.0]), 1.5
 MIN_SIGMA_DN, MIN_COUNT, MIN_COLUMNS = 3.0, 25, 8
 #: Quartiles of a Gaussian number, in standard deviations.
 QUARTILE = 0.6744897501960817
-#: Standard deviations of offsets that are tabulated, DN, and nodes of their distribution.
-OFFSETS_DN, NODES = np.linspace(0.0, 3.0, 301), np.linspace(-6.0, 6.0, 1201)
+#: Standard deviations of offsets that are tabulated, DN, and nodes of their distribution. Mean squares hardly grow above.
+OFFSETS_DN, NODES = np.linspace(0.0, 1.0, 101), np.linspace(-6.0, 6.0, 1201)
 
 
 def fit_code_widths(histograms: Sequence[Ints]) -> Estimate | Uncertain:
@@ -56,13 +57,8 @@ def fit_code_widths(histograms: Sequence[Ints]) -> Estimate | Uncertain:
     mean = float(shares @ values)
     n = values.size
     error = math.sqrt(float((shares**2) @ (values - mean) ** 2) * n / (n - 1))
-    # Above the largest mean square, transitions are in no order.
-    table = _mean_squares(OFFSETS_DN)
-    last = int(np.argmax(table))
-    found = Estimate(
-        *(float(np.interp(each, table[: last + 1], OFFSETS_DN[: last + 1])) for each in of_mean(mean, error, n))
-    )
-    if found.high == OFFSETS_DN[last]:
+    found = Estimate(*(float(np.interp(each, _mean_squares(), OFFSETS_DN)) for each in of_mean(mean, error, n)))
+    if found.high == OFFSETS_DN[-1]:
         return Uncertain(f"codes are in no order: it is above {found.low:.2g} DN")
     return found
 
@@ -92,11 +88,10 @@ def _third_differences(counts: Ints) -> tuple[Floats, Floats] | None:
     return np.convolve(relative, DIFFERENCES, "valid") ** 2 - noise, weights
 
 
-def _mean_squares(offset_dn: Floats) -> Floats:
+@cache
+def _mean_squares() -> Floats:
     """
-    Return the mean squares of third differences of code widths.
-
-    ``offset_dn``: standard deviations of the offsets of codes.
+    Return the mean squares of third differences of code widths for ``OFFSETS_DN``.
 
     An offset d moves the fraction 1 - f of the samples of a code by m codes and the fraction f by m + 1 codes, with the whole
     part m and the fraction f of d. Fractions of different codes are independent.
@@ -105,9 +100,9 @@ def _mean_squares(offset_dn: Floats) -> Floats:
     weights /= weights.sum()
     reach = math.ceil(NODES[-1] * OFFSETS_DN[-1]) + 2
     between = np.correlate(DIFFERENCES, DIFFERENCES, "full")
-    found = np.empty(offset_dn.size)
+    found = np.empty(OFFSETS_DN.size)
     rows = np.arange(NODES.size)
-    for k, sigma in enumerate(offset_dn):
+    for k, sigma in enumerate(OFFSETS_DN):
         offset = sigma * NODES
         whole = np.floor(offset).astype(int)
         moved = np.zeros((NODES.size, 2 * reach + 1))

@@ -44,12 +44,18 @@ DEAD_RESPONSE, HOT_PROBABILITY = 0.5, 0.01
 MAX_NONLINEARITY_ERROR = 0.1
 #: Rounds of the fit, with what differs between pixels from the round before.
 ROUNDS = 3
+#: Chi-square per degree of freedom from which a fit starts again, and noise and shifts of the black level there, in codes.
+UNEXPLAINED, OTHER_SIGMAS, OTHER_SHIFTS = 3.0, (0.2, 0.4), (-0.3, 0.0, 0.3)
 #: Fraction of the full well above which the first fit leaves out levels.
 CLOSE_FRACTION = 0.85
 #: Smallest variance of a pixel in the dark, over the mean one.
 MIN_SHOT_RATIO = 0.2
 #: Gain above which, and read noise below which, codes of whole electrons are more frequent than those between.
 MAX_GAIN, MIN_READ_E = 0.7, 0.6
+#: Smallest number of rows and columns.
+MIN_LINES = 4
+#: Rounds of the means of rows and columns of images with missing pixels.
+LINE_ROUNDS = 3
 #: Probability of RTS noise from which a pixel is left out of offsets.
 MAX_RTS = 0.5
 #: Charges of the response by which the signals of hot pixels become charges.
@@ -120,6 +126,12 @@ class _Fit:
             raise ParameterError("frames", "must contain a stack of dark frames: light=0, lens covered")
         if not self.lit:
             raise ParameterError("frames", "must contain stacks with light: the gain follows from their shot noise")
+        if min(statistics[0].shape) < MIN_LINES:
+            n_y, n_x = statistics[0].shape
+            raise ParameterError(
+                "frames",
+                f"must have at least {MIN_LINES} rows and columns, got {n_x} x {n_y} pixels: intervals are their differences",
+            )
         if len({each.temperature_k is None for each in lights}) > 1:
             raise ParameterError("temperature_k", "must be given for all stacks, or for none")
         self.classes = class_index(*statistics[0].shape, mosaic)
@@ -270,6 +282,8 @@ class _Fit:
             )  # fmt: skip
 
         found = fit(names)
+        if before is None and found.chi_square > UNEXPLAINED:
+            found = min((found, *map(fit, self._other_starts(names))), key=lambda each: each.chi_square)
         bend = "nonlinearity_fraction"
         if bend in names and found.error(bend) > MAX_NONLINEARITY_ERROR:
             self.estimates[bend] = Uncertain(
@@ -277,6 +291,24 @@ class _Fit:
             )
             found = fit({name: value for name, value in self.start_names(found).items() if name != bend})
         return found
+
+    def _other_starts(self, names: Mapping[str, float]) -> list[dict[str, float]]:
+        """
+        Return first values with other noise and black levels.
+
+        Where noise is small against the codes, the moments of dark frames are periodic in the black level, and the likelihood
+        has several maxima.
+        """
+        width_dn = float(self.adc.width_of_code_dn(self.levels.mean_dn.min()))
+        return [
+            {
+                **names,
+                "read_noise_e2": (sigma * width_dn / names["gain_dn_per_e"]) ** 2,
+                "black_level_dn": names["black_level_dn"] + shift * width_dn,
+            }
+            for sigma in OTHER_SIGMAS
+            for shift in OTHER_SHIFTS
+        ]
 
     def _dnl(self) -> tuple[float, float]:
         """Return the variance by DNL, which all levels have, and its standard error, DN²."""
@@ -408,6 +440,8 @@ class _Fit:
             well = values["full_well_e"]
             fixed_e[full] = 1.5 * well + 10.0 * math.sqrt(well)
         is_used = ~is_clipped
+        if not (is_used & is_dark).any():
+            raise ParameterError("frames", "must contain dark frames below the highest code; check light and bits")
         known = is_used & ~exposures.is_free & ~is_dark
         for name in sorted({exposures.light_parameter[k] for k in np.flatnonzero(known)}):
             own = [k for k in np.flatnonzero(known & ~is_saturating) if exposures.light_parameter[k] == name]
@@ -431,7 +465,7 @@ class _Fit:
         """Measure offsets, responses and noise of pixels; return their spread."""
         values = fit.values
         used = np.flatnonzero(self.is_used)
-        self.dark_slope = gain = values["gain_dn_per_e"]
+        self.gain_dn_per_e = gain = values["gain_dn_per_e"]
         bend_per_e = 2.0 * values.get("nonlinearity_fraction", 0.0) * gain / self.adc.n_codes
         offset, noise = self._mean_of(self.shortest), self._noise_of(self.shortest)
         self.offset_dn = self._centred(offset)
@@ -479,7 +513,7 @@ class _Fit:
         """Return known differences of dark currents from their mean, (n_y, n_x)."""
         if self.dark_spread is None or self.dark_slope_dn is None or self.dark_slope_noise is None:
             return None
-        mean_dn_per_s = self.dark_spread.mean * self.dark_slope
+        mean_dn_per_s = self.dark_spread.mean * self.gain_dn_per_e
         share = _reliability((self.dark_spread.fraction * mean_dn_per_s) ** 2, self.dark_slope_noise)
         return share * (self.dark_slope_dn - mean_dn_per_s)
 
@@ -489,7 +523,7 @@ class _Fit:
 
         Returns the temporal part of mean squares of rows and columns.
         """
-        gain, classes, currents = self.dark_slope, self.classes, self._currents_dn_per_s()
+        gain, classes, currents = self.gain_dn_per_e, self.classes, self._currents_dn_per_s()
         lines = {name: np.zeros(self.n_classes) for name in ("row", "column")}
         response, response_noise = np.zeros(classes.shape), np.zeros(classes.shape)
         of_offset, total = np.zeros(self.n_classes), np.zeros(self.n_classes)
@@ -531,7 +565,7 @@ class _Fit:
         """Return the distribution of the dark current over pixels, in e-/s."""
         if self.dark_slope_dn is None or self.dark_slope_noise is None:
             return None
-        gain, good = self.dark_slope, self.good
+        gain, good = self.gain_dn_per_e, self.good
         # Noise of rows is common to their pixels, and not in the variances: it is subtracted as far as means of rows show it.
         of_rows, in_row = self.dark_slope_of_rows, np.maximum(good.sum(axis=1, keepdims=True), 1)
         sums = self.dark_slope_dn.sum(axis=1, keepdims=True, where=good)
@@ -574,8 +608,12 @@ class _Fit:
         n_y, n_x = values.shape
         in_row, in_column = np.maximum(good.sum(axis=1), 1), np.maximum(good.sum(axis=0), 1)
         clean = np.where(good, values, 0.0)
-        row, column = clean.sum(axis=1) / in_row, clean.sum(axis=0) / in_column
-        left = np.where(good, clean - row[:, None] - column + clean.sum() / good.sum(), 0.0)
+        clean -= good * (clean.sum() / good.sum())
+        row, column = np.zeros(n_y), np.zeros(n_x)
+        for _ in range(LINE_ROUNDS):  # without pixels, means of rows contain columns, and those of columns rows
+            row = (clean.sum(axis=1) - good @ column) / in_row
+            column = (clean.sum(axis=0) - row @ good) / in_column
+        left = np.where(good, clean - row[:, None] - column, 0.0)
         degrees = good.sum() - n_y - n_x + 1
         scale = good.sum() / max(degrees, 1)
         squares = block_means(left**2 * scale - noise, np.where(good, self.classes, -1))
@@ -637,7 +675,7 @@ class _Fit:
 
     def _report_maps(self) -> None:
         """Collect maps of pixels, each value in proportion to its reliability."""
-        gain = self.dark_slope
+        gain = self.gain_dn_per_e
         spread2 = self._total(self.dsnu)[0] ** 2
         offset = self.offset_dn
         currents = self._currents_dn_per_s()
@@ -671,7 +709,7 @@ class _Fit:
             return
         spread = self.dark_spread
         if spread is None:
-            noise = math.sqrt(float(self.dark_slope_noise[self.good].mean())) / self.dark_slope
+            noise = math.sqrt(float(self.dark_slope_noise[self.good].mean())) / self.gain_dn_per_e
             found["dsnu_fraction"] = Uncertain(
                 f"the noise of the slopes, {noise:.3g} e-/s, hides differences of the dark current: longer dark exposures, or "
                 "more frames"
@@ -720,7 +758,7 @@ class _Fit:
         from scipy.optimize import brentq
 
         assert self.telegraph is not None
-        step_dn, gain = self.telegraph.step_dn, self.dark_slope
+        step_dn, gain = self.telegraph.step_dn, self.gain_dn_per_e
         dark_e = np.array([fit.values.get("dark_e_per_s", 0.0) * self.lights[self.telegraph_stack].exposure_s])
         chain = Chain(self.known, 1)
 
@@ -739,7 +777,7 @@ class _Fit:
     def _hot_currents(self, fit: PooledFit) -> Floats:
         """Return dark currents of hot pixels below saturation, (n_hot,) e-/s, or NaN."""
         values = fit.values
-        top_e = min(values.get("full_well_e", math.inf), 1.1 * self.adc.n_codes / self.dark_slope)
+        top_e = min(values.get("full_well_e", math.inf), 1.1 * self.adc.n_codes / self.gain_dn_per_e)
         charges_e = top_e * np.linspace(0.0, 1.0, N_CHARGES) ** 2
         codes_dn = Chain(self.known, N_CHARGES).moments(values, charges_e, np.zeros(N_CHARGES)).mean_dn
         highest = min(np.interp(CLOSE_FRACTION * top_e, charges_e, codes_dn), CLOSE_FRACTION * (self.adc.n_codes - 1))
@@ -756,10 +794,10 @@ class _Fit:
     def _report_patterns(self, fit: PooledFit) -> None:
         found, weights, blocks = self.estimates, self.levels.weights, self.levels.weights.size
         pixel, of_blocks = self.dsnu["pixel"]
-        scale = self.dark_slope**2
+        scale = self.gain_dn_per_e**2
         if self.dark_spread is not None:  # differences of the dark current in the shortest exposure
             shortest_s = self.lights[self.shortest[0]].exposure_s
-            pixel -= (self.dark_spread.fraction * self.dark_spread.mean * shortest_s * self.dark_slope) ** 2
+            pixel -= (self.dark_spread.fraction * self.dark_spread.mean * shortest_s * self.gain_dn_per_e) ** 2
         error = math.hypot(_error(of_blocks, weights), 2.0 * pixel * fit.error("gain_dn_per_e"))
         found["dsnu_e"] = of_variance(pixel / scale, error / scale, blocks)
         for name in ("row", "column"):
@@ -775,7 +813,7 @@ class _Fit:
             found |= dict.fromkeys(names, Uncertain("no level is between the dark and the saturation"))
 
     def _report_lines(self) -> None:
-        scale = self.dark_slope**2
+        scale = self.gain_dn_per_e**2
         n_y, n_x = self.classes.shape
         squares = self._mean_squares()
         for name, n, lines in (("row", n_x, n_y), ("column", n_y, n_x)):

@@ -38,7 +38,9 @@ SMALLEST_DN2 = 1e-4
 #: Noise of means in weights, as a fraction of codes: the chain's rounding.
 MEAN_FLOOR_DN = 1e-3
 #: Variance below which noise is between two codes, and errors of means, and of variances as a fraction, there.
-ROUGH_DN2, ROUGH_MEAN_DN, ROUGH_FRACTION = 0.6, 0.02, 0.2
+ROUGH_DN2, ROUGH_MEAN_DN, ROUGH_FRACTION = 0.3, 0.02, 0.2
+#: Error of the effect of the few pixels of a level that are full, or not full, as a fraction of it.
+TAIL_FRACTION = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +88,11 @@ class PooledFit:
     own_covariance: Floats
     residuals: Floats = field(default_factory=lambda: np.zeros(0))
 
+    @property
+    def chi_square(self) -> float:
+        """Sum of the squares of residuals per degree of freedom."""
+        return float(self.residuals @ self.residuals) / max(self.residuals.size - len(self.names), 1)
+
     def error(self, name: str, *, of_device: bool = False) -> float:
         """Return the standard error of a parameter; of a logarithm for positive ones."""
         matrix = self.own_covariance if of_device else self.covariance
@@ -117,7 +124,7 @@ def fit_levels(
     model.add_common_errors(vector, common_error_dn2)
     damping = DAMPING
     moments = model.moments(vector)
-    whiten = model.whitening(moments)
+    whiten = model.whitening(vector, moments)
     residual = whiten(model.residual(moments))
     for _ in range(MAX_ITERATIONS):
         jacobian = whiten(model.jacobian(vector, moments.statistics))
@@ -138,7 +145,7 @@ def fit_levels(
         if after >= before:
             break
         vector, damping, moments = vector + change, damping / 10.0, proposed
-        whiten = model.whitening(moments)
+        whiten = model.whitening(vector, moments)
         residual = whiten(model.residual(moments))
         if before - after < TOLERANCE * max(1.0, after / residual.size):
             break
@@ -243,17 +250,44 @@ class _Model:
         # Gaussian noise, and two codes where there is no other: s⁴ has the variance 2 V², and V (1 - 4 V).
         of_pixel = 2.0 * variance**2 + np.maximum(variance * (1.0 - 4.0 * variance), 0.0)
         of_variance = of_pixel / (self.levels.n_pixels * (self.levels.n_frames - 1))
-        # Between two codes, moments depend on where pixels are in a code, which is known to a part of it only.
-        is_rough = variance < ROUGH_DN2
-        of_mean = self.levels.mean_noise_dn2 + np.where(is_rough, ROUGH_MEAN_DN, MEAN_FLOOR_DN) ** 2
-        return np.concatenate((of_mean, of_variance + np.where(is_rough, ROUGH_FRACTION * variance, 0.0) ** 2))
+        return np.concatenate((self.levels.mean_noise_dn2, of_variance))
 
-    def whitening(self, moments: Moments) -> Callable[[Floats], Floats]:
+    def chain_errors(self, vector: Floats, moments: Moments) -> Floats:
+        """
+        Return the variances of the statistics by what the chain describes to a part only.
+
+        Between two codes, moments depend on where pixels are in a code: this effect of rounding decreases with the variance as
+        the Fourier transform of a Gaussian distribution.
+        """
+        variance = np.maximum(moments.variance_dn2, SMALLEST_DN2)
+        rough = np.exp(-2.0 * math.pi**2 * np.maximum(variance - ROUGH_DN2, 0.0))
+        of_mean = (ROUGH_MEAN_DN * rough) ** 2 + MEAN_FLOOR_DN**2
+        of_variance = (ROUGH_FRACTION * rough * variance) ** 2
+        return np.concatenate((of_mean, of_variance)) + self._tail_errors(vector, moments) ** 2
+
+    def _tail_errors(self, vector: Floats, moments: Moments) -> Floats:
+        """
+        Return errors of the statistics of levels of which only some pixels are full.
+
+        They depend on the tails of distributions, which a Gaussian describes to a part of their effect only.
+        """
+        if WELL not in self.names:
+            return np.zeros(moments.statistics.size)
+        values, light_e, dark_e = self.charges(vector)
+        well_e = values.pop(WELL)
+        without = self.chain.moments(values, light_e, dark_e)
+        full = self.chain.moments(values | {WELL: well_e}, np.full(light_e.size, 2.0 * well_e), dark_e)
+        mean, variance = moments.mean_dn, moments.variance_dn2
+        of_mean = np.minimum(np.abs(without.mean_dn - mean), np.abs(full.mean_dn - mean))
+        missing = 1.0 - variance / np.maximum(without.variance_dn2, SMALLEST_DN2)
+        return TAIL_FRACTION * np.concatenate((of_mean, variance * np.clip(missing, 0.0, 1.0)))
+
+    def whitening(self, vector: Floats, moments: Moments) -> Callable[[Floats], Floats]:
         """Return the map to uncorrelated statistics of variance 1, for noise and pixels."""
         from scipy.linalg import solve_triangular
 
         matrix = moments.sampling() / np.tile(self.levels.n_pixels, 2) + self.common
-        matrix[np.diag_indices_from(matrix)] += self.noise(moments)
+        matrix[np.diag_indices_from(matrix)] += self.noise(moments) + self.chain_errors(vector, moments)
         scale = np.sqrt(np.diag(matrix))
         factor = np.linalg.cholesky(matrix / np.multiply.outer(scale, scale))
         return lambda values: np.asarray(solve_triangular(factor, (values.T / scale).T, lower=True))
@@ -293,7 +327,8 @@ class _Model:
     def result(self, vector: Floats, variance_error_dn2: Floats) -> PooledFit:
         """Return the fit with its covariances."""
         levels, moments = self.levels, self.moments(vector)
-        whiten, noise = self.whitening(moments), self.noise(moments)
+        whiten = self.whitening(vector, moments)
+        noise, of_chain = self.noise(moments), self.chain_errors(vector, moments)
         jacobian = whiten(self.jacobian(vector, moments.statistics))
         to_vector = (
             np.linalg.pinv(jacobian.T @ jacobian, hermitian=True, rcond=1e-12) @ jacobian.T @ whiten(np.eye(noise.size))
@@ -308,7 +343,7 @@ class _Model:
         off[known] = 0.0
         n_blocks = levels.weights.size
         over_blocks = (off * levels.weights**2) @ off.T * n_blocks / max(n_blocks - 1, 1)
-        over_blocks += self.common
+        over_blocks += self.common + np.diag(of_chain)
         over_blocks[known, known] = variance_error_dn2[known - levels.mean_dn.size] ** 2
         values, free_e = self.unpack(vector)
         values |= {f"level_e_{k}": float(value) for k, value in zip(self.free, free_e, strict=True)}
@@ -320,6 +355,6 @@ class _Model:
             slopes_dn_per_e=moments.slope_dn_per_e,
             light_e=self.charges(vector)[1],
             covariance=to_vector @ over_blocks @ to_vector.T,
-            own_covariance=(to_vector * noise) @ to_vector.T,
+            own_covariance=(to_vector * (noise + of_chain)) @ to_vector.T,
             residuals=whiten(self.residual(moments)),
         )

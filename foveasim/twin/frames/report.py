@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.validation import unit_of
+from foveasim.twin.frames.intervals import Estimate
 from foveasim.view.web._report_page import (
     FAINT,
     INK,
@@ -41,7 +42,7 @@ TITLES = {
     "column_noise_e": "temporal noise of columns",
     "full_well_e": "full well",
     "nonlinearity_fraction": "response nonlinearity, loss at the end of the range",
-    "dnl_dn": "DNL: offsets of codes in a column, standard deviation",
+    "dnl_dn": "DNL, standard deviation in a column",
     "dark_e_per_s": "dark current",
     "dark_doubling_k": "temperature rise that doubles the dark current",
     "dsnu_fraction": "nonuniformity of the dark current, over its mean",
@@ -67,8 +68,8 @@ MAPS = {
     "rts_probability": "probability of RTS noise",
     "is_defect": "defects",
 }
-#: Number above which there is no decimal point, and quantiles of black and white.
-MANY = 1000.0
+#: Number above which there is no decimal point, largest number of decimals of an interval, and quantiles of black and white.
+MANY, MAX_DECIMALS = 1000.0, 7
 QUANTILES = (0.005, 0.995)
 #: Longest side of the picture of a map, and chi-square per degree of freedom up to which a fit is good.
 MAX_SIDE, GOOD_RATIO = 512, 1.5
@@ -142,10 +143,7 @@ def report_page(twin: Twin) -> str:
 
 
 def _tables(twin: Twin) -> list[ReportTable]:
-    rows = [
-        [TITLES.get(name, name), _shown(each.value), f"{_shown(each.low)} to {_shown(each.high)}", unit_of(name), name]
-        for name, each in twin.estimates.items()
-    ]
+    rows = [[TITLES.get(name, name), *_interval(each), unit_of(name), name] for name, each in twin.estimates.items()]
     tables = [
         ReportTable(
             ("Parameter", "value", "95 % interval", "unit", "name"), rows, "Parameters that the frames determine."
@@ -162,6 +160,14 @@ def _tables(twin: Twin) -> list[ReportTable]:
 def _shown(value: float) -> str:
     """Return a number with four digits, or all before the point."""
     return f"{value:,.0f}" if abs(value) >= MANY else f"{value:.4g}"
+
+
+def _interval(each: Estimate) -> tuple[str, str]:
+    """Return a value and its interval, with two digits of the width of the interval."""
+    width = each.high - each.low
+    decimals = min(max(1 - math.floor(math.log10(width)), 0), MAX_DECIMALS) if width > 0.0 else 4
+    value, low, high = (f"{number:,.{decimals}f}" for number in each)
+    return value, f"{low} to {high}"
 
 
 def _levels(twin: Twin) -> ReportTable:

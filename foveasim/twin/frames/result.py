@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -73,12 +73,18 @@ class Twin:
     estimates: Mapping[str, Estimate]
     not_identifiable: Mapping[str, str]
     maps: Mapping[str, Floats]
-    levels: tuple[Mapping[str, Any], ...]
+    levels: Sequence[Mapping[str, Any]]
     assumptions: tuple[str, ...]
     pixel_um: float
     known: Mapping[str, Any]
     n_fitted: int
     temperature_k: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "maps", {name: frozen_array(each) for name, each in self.maps.items()})
+        for name in ("estimates", "not_identifiable", "maps", "known"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        object.__setattr__(self, "levels", tuple(MappingProxyType(dict(each)) for each in self.levels))
 
     def __repr__(self) -> str:
         n_y, n_x = next(iter(self.maps.values())).shape
@@ -267,13 +273,13 @@ def _check_stored(about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) 
 
 def _restored(about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Twin:
     return Twin(
-        MappingProxyType({name: Estimate(*map(float, each)) for name, each in about["estimates"].items()}),
-        MappingProxyType({str(name): str(reason) for name, reason in about["not_identifiable"].items()}),
-        MappingProxyType({name: frozen_array(np.asarray(each, np.float64)) for name, each in arrays.items()}),
-        tuple(MappingProxyType(each) for each in about["levels"]),
+        {name: Estimate(*map(float, each)) for name, each in about["estimates"].items()},
+        {str(name): str(reason) for name, reason in about["not_identifiable"].items()},
+        {name: np.asarray(each, np.float64) for name, each in arrays.items()},
+        tuple(about["levels"]),
         tuple(map(str, about["assumptions"])),
         float(about["pixel_um"]),
-        MappingProxyType(about["known"]),
+        about["known"],
         int(about["n_fitted"]),
         None if about["temperature_k"] is None else float(about["temperature_k"]),
     )
@@ -302,13 +308,13 @@ def twin_of(fitted: Fitted, names: list[str], pixel_um: float, known: Mapping[st
         name: frozen_array(np.asarray(each, np.float64)) for name, each in fitted.maps.items()
     }
     return Twin(
-        MappingProxyType({name: each for name, each in fitted.estimates.items() if isinstance(each, Estimate)}),
-        MappingProxyType({name: each.reason for name, each in fitted.estimates.items() if isinstance(each, Uncertain)}),
-        MappingProxyType(maps),
-        tuple(MappingProxyType(each) for each in rows),
+        {name: each for name, each in fitted.estimates.items() if isinstance(each, Estimate)},
+        {name: each.reason for name, each in fitted.estimates.items() if isinstance(each, Uncertain)},
+        maps,
+        tuple(rows),
         tuple(fitted.assumptions),
         pixel_um,
-        MappingProxyType(dict(known)),
+        known,
         len(fit.names),
         fitted.temperature_k,
     )

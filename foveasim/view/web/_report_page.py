@@ -26,6 +26,8 @@ LIGHT, DARK = {INK: "#1b2230", FAINT: "#d5d9e0"}, {INK: "#e8ebf0", FAINT: "#4048
 #: Size of figures.
 FIGURE_INCHES = (4.7, 3.1)
 POLICY = "default-src 'none'; style-src '{style}'; img-src data:; base-uri 'none'; form-action 'none'"
+#: Characters of a cell above which its column is text with lines.
+MAX_CELL = 40
 
 
 @dataclass(frozen=True)
@@ -166,10 +168,19 @@ def _section(section: ReportSection, *, is_first: bool) -> str:
 
 
 def _table(table: ReportTable) -> str:
-    heads = "".join(f'<th scope="col">{_text(head)}</th>' for head in table.heads)
+    kinds = [
+        ' class="prose"' if any(len(row[k]) > MAX_CELL for row in table.rows) else ""
+        for k in range(1, len(table.heads))
+    ]
+    heads = "".join(
+        f'<th scope="col"{kind}>{_text(head)}</th>' for head, kind in zip(table.heads, ["", *kinds], strict=True)
+    )
     rows = "\n".join(
         f'<tr><th scope="row">{_text(head)}</th>'
-        + "".join(f"<td>{_emphasised(cell) if k == best else _text(cell)}</td>" for k, cell in enumerate(cells))
+        + "".join(
+            f"<td{kind}>{_emphasised(cell) if k == best else _text(cell)}</td>"
+            for k, (cell, kind) in enumerate(zip(cells, kinds, strict=True))
+        )
         + "</tr>"
         for (head, *cells), best in zip_longest(table.rows, table.best)
     )
