@@ -37,8 +37,12 @@ from foveasim.optics._imaging import MapRows
 if TYPE_CHECKING:
     from foveasim.fields import SceneLike
 
-#: Step of the blur radius between neighbouring pixels, in cells, above which a surface ends behind another one.
-STEP_CELLS = 1.5
+#: Step of the blur radius between neighbouring pixels, in cells, above which a surface ends behind another one; and the smaller
+#: step, which is an edge if it is at least so many times that of both adjacent pairs of pixels: else the surface is steep, or
+#: its distances are noisy.
+STEP_CELLS, MIN_STEP_CELLS, STEP_RATIO = 1.5, 0.5, 4.0
+#: Cells beyond the blur that a surface is continued.
+REACH_CELLS = 2.0
 #: Smallest sum of shares: a division by less would amplify rounding errors.
 MIN_SHARE = 1e-3
 #: Rows of maps that are composed together.
@@ -143,20 +147,23 @@ def _distance_m(depth_m: Floats, focus_m: float) -> float:
 def _continued(radius: Floats, visible: Ints) -> tuple[Ints, Ints]:
     """Return the layer behind each pixel, and the pixel at whose rim its surface ends."""
     is_rim = np.zeros(radius.shape, bool)
-    for axis in (0, 1):
-        ahead = np.diff(radius, axis=axis) > STEP_CELLS  # the next pixel is nearer
-        behind = np.diff(radius, axis=axis) < -STEP_CELLS
-        low, high = [slice(None)] * 2, [slice(None)] * 2
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        is_rim[tuple(low)] |= ahead
-        is_rim[tuple(high)] |= behind
+    for along, rims in ((radius, is_rim), (radius.T, is_rim.T)):
+        step = np.diff(along, axis=1)  # > 0: the next pixel is nearer
+        size = np.pad(np.abs(step), ((0, 0), (1, 1)))
+        slope = np.maximum(size[:, :-2], size[:, 2:])
+        is_edge = size[:, 1:-1] > np.minimum(STEP_CELLS, np.maximum(MIN_STEP_CELLS, STEP_RATIO * slope))
+        rims[:, :-1] |= is_edge & (step > 0.0)
+        rims[:, 1:] |= is_edge & (step < 0.0)
     if not is_rim.any():
         return np.full(radius.shape, -1, np.int32), np.zeros(radius.shape, np.int32)
     from scipy.ndimage import distance_transform_edt
 
-    at_y, at_x = distance_transform_edt(~is_rim, return_distances=False, return_indices=True)
+    distance, (at_y, at_x) = distance_transform_edt(~is_rim, return_indices=True)
     rim = at_y * radius.shape[1] + at_x
-    is_behind: Bools = radius - radius.ravel()[rim] > STEP_CELLS
+    of_rim_cells = radius.ravel()[rim]
+    # Light of the hidden surface arrives within the blur of both.
+    is_near = distance < np.abs(radius) + np.abs(of_rim_cells) + REACH_CELLS
+    is_behind: Bools = is_near & (radius - of_rim_cells > MIN_STEP_CELLS)
     of_rim = visible.ravel()[rim]
     return np.where(is_behind & (of_rim > visible), of_rim, np.int32(-1)), rim
 
