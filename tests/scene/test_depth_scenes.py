@@ -3,6 +3,8 @@
 import pickle
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -206,6 +208,75 @@ def test_video_follows_depth_of_each_frame():
 
     np.testing.assert_array_equal(moved.code, alone.code)
     assert (still.expected_e != moved.expected_e).any()
+
+
+def test_frames_of_video_have_depth_of_template():
+    picture, depth_m = disc_before_wall()
+    template = fs.Scene.from_rgbd(picture, depth_m, **LIGHT)
+
+    (frame,) = fs.video.FrameSource([picture[::-1]], template=template, encoding="linear")
+
+    np.testing.assert_array_equal(frame.depth_m, template.depth_m)
+    with pytest.raises(ParameterError, match="'depth_m' must have the shape of the picture"):
+        next(iter(fs.video.FrameSource([picture[:20]], template=template, encoding="linear")))
+
+
+def test_threads_and_processes_agree():
+    scene, cam = fs.Scene.from_rgbd(*disc_before_wall(), **LIGHT), camera(focus_distance_m=0.5)
+    expected = cam.predict(scene, exposure_s=0.01)[0]
+
+    with ThreadPoolExecutor(3) as pool:
+        found = list(pool.map(lambda _: cam.predict(scene, exposure_s=0.01)[0], range(3)))
+    code = (
+        "import pickle, sys; cam, scene = pickle.load(sys.stdin.buffer); "
+        "sys.stdout.buffer.write(pickle.dumps(cam.predict(scene, exposure_s=0.01)[0]))"
+    )
+    other = subprocess.run(
+        [sys.executable, "-c", code], input=pickle.dumps((cam, scene)), capture_output=True, check=True
+    )
+
+    for mean in (*found, pickle.loads(other.stdout)):
+        np.testing.assert_array_equal(mean, expected)
+
+
+@pytest.mark.parametrize("padding", ["reflect", "zero"])
+def test_maps_do_not_depend_on_threads(padding):
+    scene = fs.Scene.from_rgbd(*disc_before_wall((200, 96)), pitch_um=400.0, **LIGHT)
+    optics = fs.Optics(focal_length_mm=8.0, f_number=2.0, padding=padding)
+
+    np.testing.assert_array_equal(optics.power_map(scene, n_threads=1).data, optics.power_map(scene, n_threads=3).data)
+
+
+def test_dual_pixels_share_electrons():
+    """The halves of each pair of photodiodes collect what the full pupil does, up to their displacement."""
+    scene = fs.Scene.from_rgbd(*disc_before_wall(), **LIGHT)
+    left, right, full = (
+        camera(pupil_part=part).capture(scene, exposure_s=0.01, seed=0).expected_e for part in ("left", "right", "full")
+    )
+
+    assert left.sum() + right.sum() == pytest.approx(full.sum(), rel=2e-3)
+    assert np.abs(left - right).max() > 0.05 * full.mean()
+
+
+def test_sweep_varies_focus_and_layers(settings):
+    values = {"optics.focus_distance_m": [0.5, 2.0], "scene.depth_layers": [1, 100]}
+
+    found = fs.explore.sweep(settings, values, metrics=["snr"], workers=0)["snr_median"]
+
+    assert len(np.unique(found)) == 4
+
+
+def test_datasets_refuse_depth(settings):
+    with pytest.raises(
+        (FileError, ParameterError), match="must be 'picture' for a dataset, which supplies the pictures"
+    ):
+        fs.explore.Dataset([np.ones((48, 64))], settings)
+
+
+def test_panoramas_refuse_depth():
+    panorama = fs.Scene.from_panorama(np.ones((16, 32)), luminance_cd_m2=100.0)
+    with pytest.raises(ParameterError, match="'depth_m' must not be given for a panorama"):
+        replace(panorama, depth_m=np.ones((16, 32)))
 
 
 def test_crops_of_gaze_paths_keep_depth():
