@@ -96,6 +96,24 @@ def test_middlebury_disparities_follow_calibration(tmp_path):
     assert found[0, 1] == np.inf
 
 
+def test_pfm_of_middlebury_is_read(tmp_path):
+    """Rows of PFM start at the bottom; calib.txt is that of the scene Motorcycle."""
+    disparity = np.array([[100.0, np.inf, 50.0], [200.0, 100.0, np.inf]], "<f4")
+    (tmp_path / "disp0.pfm").write_bytes(b"Pf\n3 2\n-1.0\n" + disparity[::-1].tobytes())
+    (tmp_path / "calib.txt").write_text(
+        "cam0=[3979.911 0 1244.772; 0 3979.911 1019.507; 0 0 1]\n"
+        "cam1=[3979.911 0 1369.115; 0 3979.911 1019.507; 0 0 1]\n"
+        "doffs=124.343\nbaseline=193.001\nwidth=2964\nheight=2000\nndisp=280\nisint=0\nvmin=31\nvmax=257\n"
+    )
+
+    found = distances_of(
+        str(tmp_path / "disp0.pfm"), shape=(2, 3), depth_format="middlebury",
+        calibration=tmp_path / "calib.txt", missing="far",
+    )  # fmt: skip
+
+    np.testing.assert_allclose(found, [[3.42389, np.inf, 4.40584], [2.36825, 3.42389, np.inf]], rtol=1e-5)
+
+
 def test_depth_channel_of_exr_is_read(tmp_path):
     exr = pytest.importorskip("OpenEXR")
     depth = np.array([[1.0, 2.0], [3.0, np.inf]], np.float32)
