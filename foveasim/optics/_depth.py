@@ -66,7 +66,11 @@ class Layer:
     rim: Ints
 
     def rows(self, n_x: int) -> tuple[int, int]:
-        """Return the first row of a picture with n_x columns that has pixels of the layer, and the last, excluded."""
+        """
+        Return the range of rows that have pixels of the layer.
+
+        ``n_x``: number of columns of the picture.
+        """
         ends = [pixels[[0, -1]] // n_x for pixels in (self.visible, self.hidden) if pixels.size]
         return min(int(first) for first, _ in ends), max(int(last) for _, last in ends) + 1
 
