@@ -391,7 +391,7 @@ def fill_pixels(value, target, out):
 @njit([types.boolean(r[:, ::1], r[:, ::1], r, r[:, ::1], r[:, ::1]) for _, r in _PAIRS])
 def add_layer(share, light, scale, total, left):
     """
-    Add rows of a layer to a map, and fill the part of the pupil that nearer layers have left.
+    Add rows of a layer to a map, and fill what nearer layers have left of the pupil.
 
     ``share`` times ``scale`` is the part of the pupil that the layer would fill alone, and ``light`` its irradiance then. A
     share within what is left keeps its light as it is, rounding errors included, which conserves energy. Returns whether
