@@ -204,7 +204,8 @@ class Results:
         """
         Return the difference of charge between the states of RTS noise.
 
-        Their codes, in linear codes by the width at their mean, are a step apart.
+        In linear codes, by the width at the mean of both states, the variance of a pixel exceeds that of others by that of the
+        states, and by their own noise, which companding makes different.
         """
         from scipy.optimize import brentq
 
@@ -213,13 +214,17 @@ class Results:
         dark_e = np.array([values.get("dark_e_per_s", 0.0) * exposure_s])
         chain = Chain(self.recording.known, 1)
 
-        def code_dn(charge_e: float) -> float:
+        def code(charge_e: float) -> tuple[float, float]:
             shifted = {**values, "black_level_dn": values["black_level_dn"] + gain * charge_e}
-            return float(chain.moments(shifted, np.zeros(1), dark_e).mean_dn[0])
+            moments = chain.moments(shifted, np.zeros(1), dark_e)
+            return float(moments.mean_dn[0]), float(moments.variance_dn2[0])
+
+        _, noise_dn2 = code(0.0)
 
         def above(step_e: float) -> float:
-            upper, lower = code_dn(0.5 * step_e), code_dn(-0.5 * step_e)
-            return (upper - lower) * float(adc.width_of_code_dn(0.5 * (upper + lower))) - step_dn
+            (upper, upper_dn2), (lower, lower_dn2) = code(0.5 * step_e), code(-0.5 * step_e)
+            excess_dn2 = 0.25 * (upper - lower) ** 2 + 0.5 * (upper_dn2 + lower_dn2) - noise_dn2
+            return excess_dn2 * float(adc.width_of_code_dn(0.5 * (upper + lower))) ** 2 - 0.25 * step_dn**2
 
         guess = step_dn / gain
         low, high = 0.2 * guess, 5.0 * guess
