@@ -35,7 +35,16 @@ MAX_GAIN, MIN_READ_E = 0.7, 0.6
 #: Charges of the response by which the signals of hot pixels become charges.
 N_CHARGES = 400
 #: Parameters that quantisation hides with the read noise.
-HIDDEN = ("dsnu_e", "dsnu_row_e", "dsnu_column_e", "row_noise_e", "column_noise_e", "rts_fraction", "rts_e")
+HIDDEN = (
+    "dsnu_fraction",
+    "dsnu_e",
+    "dsnu_row_e",
+    "dsnu_column_e",
+    "row_noise_e",
+    "column_noise_e",
+    "rts_fraction",
+    "rts_e",
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,9 +97,11 @@ def measure_pixels(recording: Recording, defects: Defects, chain: ChainFit) -> P
     """Measure offsets, responses and dark currents of pixels, with a fit of the chain."""
     gain, weights = chain.values["gain_dn_per_e"], chain.levels.weights
     offset, noise, line_noise = recording.dark_mean_dn, recording.dark_noise_dn2, recording.line_noise_dn2
-    good = recording.good & (defects.rts_probability < MAX_RTS)  # a mean code of two states is not that of the mean
+    good = recording.good & (
+        defects.rts_probability < MAX_RTS
+    )  # a mean of two states is not that of the mean, and noisier
     offset_dn = _centred(recording, offset)
-    dark = _dark_spread(recording, defects, gain)
+    dark = _dark_spread(defects, good, gain)
     currents_dn_per_s = _currents_dn_per_s(defects, dark, gain)
     response, response_noise, response_lines = _responses(recording, chain, offset_dn, noise, currents_dn_per_s)
     prnu = _parts(recording, good, response, response_noise, response_lines or dict.fromkeys(line_noise, 0.0), weights)
@@ -181,11 +183,11 @@ def _responses(
     return response * scale, noise, of_lines
 
 
-def _dark_spread(recording: Recording, defects: Defects, gain: float) -> DarkSpread | None:
-    """Return the distribution of the dark current over pixels, in e-/s."""
+def _dark_spread(defects: Defects, good: Bools, gain: float) -> DarkSpread | None:
+    """Return the distribution of the dark current over good pixels, in e-/s."""
     if defects.slopes is None:
         return None
-    slopes, good = defects.slopes, recording.good
+    slopes = defects.slopes
     # Noise of rows is common to their pixels, and not in the variances: it is subtracted as far as means of rows show it.
     of_rows, in_row = slopes.row_noise_dn2, np.maximum(good.sum(axis=1, keepdims=True), 1)
     sums = slopes.dn_per_s.sum(axis=1, keepdims=True, where=good)
