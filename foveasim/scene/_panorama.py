@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.calls import POSITIVE, Limits, OwnCheck, check_declared
 from foveasim._core.threads import parallel_map
-from foveasim._core.validation import Floats, Images, read_only
+from foveasim._core.validation import Floats, Images, finite_array, read_only
 from foveasim._projections import LAWS, ImageProjection
 from foveasim.errors import ParameterError
 
@@ -29,6 +29,7 @@ MAX_SUMS = 2**26
 MIN_COSINE = 1e-9
 #: Angles of the orientation.
 TURN = Limits(at_least=-360.0, at_most=360.0, hint="angles are in degrees")
+MAX_AZIMUTH_DEG, MAX_ELEVATION_DEG = 360.0, 90.0
 #: Cells of an image, if given.
 CELLS = Limits(at_least=16, at_most=8192)
 #: Columns and rows of faces in a horizontal cross.
@@ -65,8 +66,8 @@ class Panorama:
         Calibration of a fisheye photograph.
     pixel_um : float, optional, µm
         Its pixel size.
-    gaze_deg : (azimuth, elevation), degrees
-        Direction towards which the camera turns from this orientation.
+    gaze_deg : (azimuth, elevation), optional, degrees
+        Direction towards which the camera turns from this orientation, instead of its gaze.
     """
 
     mapping: Mapping = "equirectangular"
@@ -76,10 +77,12 @@ class Panorama:
     cells: Annotated[int | Literal["auto"], CELLS] = "auto"
     lens: OwnCheck[Any] = None
     pixel_um: Annotated[float | None, POSITIVE] = None
-    gaze_deg: tuple[float, float] = (0.0, 0.0)
+    gaze_deg: OwnCheck[tuple[float, float] | None] = None
 
     def __post_init__(self) -> None:
         check_declared(self)
+        if self.gaze_deg is not None:
+            object.__setattr__(self, "gaze_deg", check_direction("gaze_deg", self.gaze_deg))
         is_fisheye = self.mapping == "fisheye"
         if is_fisheye and not hasattr(self.lens, "project"):
             raise ParameterError(
@@ -115,7 +118,7 @@ class Panorama:
     def rotation(self) -> Floats:
         """Rotation (3, 3) from directions of the camera to those of the panorama."""
         yaw, pitch, roll, azimuth, elevation = (
-            math.radians(each) for each in (self.yaw_deg, self.pitch_deg, self.roll_deg, *self.gaze_deg)
+            math.radians(each) for each in (self.yaw_deg, self.pitch_deg, self.roll_deg, *(self.gaze_deg or (0.0, 0.0)))
         )
         c, s = math.cos(roll), math.sin(roll)
         rolled = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -217,6 +220,16 @@ class Panorama:
             *(np.clip(u + side * half_u, 0.0, n_x) for side in (-1, 1)),
             *(np.clip(v + side * half_v, 0.0, n_y) for side in (-1, 1)),
         )
+
+
+def check_direction(name: str, value: Any) -> tuple[float, float]:
+    """Return an azimuth and an elevation in degrees after validation."""
+    found = finite_array(name, value)
+    if found.shape != (2,) or abs(found[0]) > MAX_AZIMUTH_DEG or abs(found[1]) > MAX_ELEVATION_DEG:
+        raise ParameterError(
+            name, "must be two numbers: the azimuth, within ±360, and the elevation, within ±90", value, "degrees"
+        )
+    return float(found[0]), float(found[1])
 
 
 def _turned(azimuth_rad: float, elevation_rad: float) -> Floats:
