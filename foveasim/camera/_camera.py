@@ -20,7 +20,7 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.show import load, view_method
 from foveasim._core.threads import cached_property, thread_count
 from foveasim._core.validation import Floats, check_per_site, check_point, finite_array
-from foveasim._projections import ImageProjection
+from foveasim._projections import ImageProjection, check_direction
 from foveasim.camera._clock import Clock
 from foveasim.camera._colour import colour_correction
 from foveasim.camera._exposure import ExposureTime
@@ -44,7 +44,7 @@ from foveasim.optics import Optics
 from foveasim.reconstruct import Picture, reference
 from foveasim.reconstruct.rasters import sum_of_images
 from foveasim.scene import Scene
-from foveasim.scene._panorama import Panorama, check_direction
+from foveasim.scene._panorama import Panorama
 from foveasim.sensor import Footprints, NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET, PERCENTILE, TARGET

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from foveasim._core.calls import POSITIVE, Limits, OwnCheck, check_declared
 from foveasim._core.threads import parallel_map
-from foveasim._core.validation import Floats, Images, finite_array, read_only
-from foveasim._projections import LAWS, ImageProjection
+from foveasim._core.validation import Floats, Images, read_only
+from foveasim._projections import LAWS, ImageProjection, check_direction, turned
 from foveasim.errors import ParameterError
 
 #: Arrangement of the directions of a picture.
@@ -29,7 +29,6 @@ MAX_SUMS = 2**26
 MIN_COSINE = 1e-9
 #: Angles of the orientation.
 TURN = Limits(at_least=-360.0, at_most=360.0, hint="angles are in degrees")
-MAX_AZIMUTH_DEG, MAX_ELEVATION_DEG = 360.0, 90.0
 #: Cells of an image, if given.
 CELLS = Limits(at_least=16, at_most=8192)
 #: Columns and rows of faces in a horizontal cross.
@@ -122,7 +121,7 @@ class Panorama:
         )
         c, s = math.cos(roll), math.sin(roll)
         rolled = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        return _turned(yaw, pitch) @ rolled @ _turned(azimuth, elevation)
+        return turned(yaw, pitch) @ rolled @ turned(azimuth, elevation)
 
     def n_cells(self, shape: tuple[int, ...], extent: float) -> int:
         """Return the cells along the longer side of an image, of ``extent`` focal lengths."""
@@ -220,24 +219,6 @@ class Panorama:
             *(np.clip(u + side * half_u, 0.0, n_x) for side in (-1, 1)),
             *(np.clip(v + side * half_v, 0.0, n_y) for side in (-1, 1)),
         )
-
-
-def check_direction(name: str, value: Any) -> tuple[float, float]:
-    """Return an azimuth and an elevation in degrees after validation."""
-    found = finite_array(name, value)
-    if found.shape != (2,) or abs(found[0]) > MAX_AZIMUTH_DEG or abs(found[1]) > MAX_ELEVATION_DEG:
-        raise ParameterError(
-            name, "must be two numbers: the azimuth, within ±360, and the elevation, within ±90", value, "degrees"
-        )
-    return float(found[0]), float(found[1])
-
-
-def _turned(azimuth_rad: float, elevation_rad: float) -> Floats:
-    """Return the rotation (3, 3) of a camera to the right and upwards."""
-    c, s = math.cos(azimuth_rad), math.sin(azimuth_rad)
-    right = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-    c, s = math.cos(elevation_rad), math.sin(elevation_rad)
-    return right @ np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
 
 
 def _half_widths(at: Floats) -> Floats:

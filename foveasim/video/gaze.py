@@ -17,6 +17,7 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
 from foveasim._io.atomic import atomic_write
 from foveasim._io.text_files import read_columns
+from foveasim._projections import check_direction
 from foveasim.camera import Camera
 from foveasim.camera._frames import Frame, PathPosition, TimedFrames, carried_times, path_digests, path_positions
 from foveasim.errors import FileError, ParameterError, format_value
@@ -24,7 +25,6 @@ from foveasim.fields import PowerMap
 from foveasim.modes.frame_times import FrameTimes
 from foveasim.optics import Optics
 from foveasim.scene import Scene
-from foveasim.scene._panorama import check_direction
 from foveasim.sensor.limits import DURATION
 
 __all__ = [

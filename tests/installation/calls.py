@@ -656,6 +656,7 @@ CALLS = {
     "reconstruct.natural": lambda o: reconstruct.natural(o.layout, o.expected_e, o.grid),
     "reconstruct.raster_grid": lambda o: reconstruct.raster_grid(o.layout, 32),
     "reconstruct.reference": lambda o: reconstruct.reference(o.power_map, o.grid),
+    "reconstruct.unwrap": lambda o: reconstruct.unwrap(o.picture, o.lens, max_pixels=32),
     "reconstruct.to_cortical": lambda o: reconstruct.to_cortical(o.picture, n_rings=4, n_sectors=8, r_max_um=10.0),
     "scene.charts.bar_elements": lambda o: charts.bar_elements((0,)),
     "scene.charts.bars": lambda o: charts.bars(groups=(3,), **SHEET),
