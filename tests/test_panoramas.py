@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 
 import foveasim as fs
 from foveasim.distortion import DoubleSphere, Fisheye, PolynomialFisheye, Scaramuzza
@@ -447,3 +449,34 @@ def test_own_lens_models_image_panoramas():
     }
     np.testing.assert_array_equal(found["auto"], found["rectilinear"])
     np.testing.assert_allclose(found["equidistant"], found["rectilinear"], rtol=5e-4)
+
+
+def test_outlines_around_the_back_pole_are_dark():
+    """The direction opposite to the axis is a circle on the sensor; a site that contains it is outside the field."""
+    angle = 2.0 * math.pi * np.arange(64) / 64
+    circle = np.stack((np.cos(angle), np.sin(angle)), axis=1)
+    disc, around = 1.02 * math.pi * FOCAL_UM * circle, fs.layout.grid(4, 4, 8000.0)
+    lens, scene = Fisheye(projection="equidistant", focal_um=FOCAL_UM), panorama(radiance, 64, cells=64)
+    whole = fs.Layout.from_polygons([disc])
+    with pytest.raises(
+        ParameterError, match="'fit' must be used with a layout that has photosites in the image circle"
+    ):
+        power_over_radiance(lens, whole, scene)
+    mixed = fs.Layout.from_polygons([*around.polygons(), shapely.Polygon(disc, [0.9 * disc])])
+    with pytest.warns(fs.errors.CoverageWarning, match=r"1 of 17 photosites lie outside the image circle"):
+        found = power_over_radiance(lens, mixed, scene)
+    assert found[-1] == 0.0
+    assert found[:-1].min() > 0.0
+
+
+def test_oblique_chief_rays_cause_a_warning():
+    stack = fs.sensor.ApertureStack(height_um=4.0, refractive_index=1.5)
+    scene = panorama(radiance, 64, cells=64)
+    lens = Fisheye(projection="equidistant", focal_um=FOCAL_UM)
+    sensor = fs.Sensor(fs.layout.grid(8, 8, 7000.0), pixel_optics=stack)
+    with pytest.warns(fs.errors.FoveasimWarning, match=r"chief rays reach the sensor at up to 60.*exit_pupil_mm"):
+        fs.Camera(optics=optics(), sensor=sensor, distortion=lens).photoelectrons_per_s(scene)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        far = fs.Camera(optics=optics(exit_pupil_mm=100.0), sensor=sensor, distortion=lens)
+        far.photoelectrons_per_s(scene)

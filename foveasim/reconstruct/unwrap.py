@@ -112,7 +112,7 @@ def unwrap(
         half_x = half_y = float(LAWS[projection].height(np.array([half_rad]))[0])
     pitch = 2.0 * half_x / max_pixels
     shape = max(1, round(2.0 * half_y / pitch)), max_pixels
-    known = np.isfinite(picture.data).all(axis=0)
+    known = np.asarray(np.isfinite(picture.data).all(axis=0))
     values = np.where(known, picture.data, 0.0)
     weights, sums = np.zeros(shape), np.zeros((picture.data.shape[0], *shape))
     x0_um, y0_um = picture.grid.origin_um
