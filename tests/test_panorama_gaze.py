@@ -146,7 +146,7 @@ def test_settings_files_turn_the_camera(tmp_path, camera):
     scene = fs.Scene.from_panorama(sky, luminance_cd_m2=500.0, cells=64)
     expected = camera.with_gaze(gaze_deg=GAZE_DEG).photoelectrons_per_s(scene)
     np.testing.assert_array_equal(shot.camera.photoelectrons_per_s(shot.scene), expected)
-    assert "gaze_deg=(70.0, -20.0)" in to_python(yaml.safe_load(SHOT))
+    assert "gaze_deg=[70.0, -20.0]" in to_python(yaml.safe_load(SHOT))
 
     (tmp_path / "gaze.csv").write_text("t_s,azimuth_deg,elevation_deg\n0,0,0\n1,90,10\n")
     path = read_gaze_path(tmp_path / "gaze.csv")

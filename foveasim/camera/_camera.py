@@ -26,7 +26,7 @@ from foveasim.camera._colour import colour_correction
 from foveasim.camera._exposure import ExposureTime
 from foveasim.camera._footprints import FootprintCache, find_incidence, placed
 from foveasim.camera._frames import Frame, ImageCache, Position, check_frames
-from foveasim.camera._framing import Turn, axis_of, common_bounds_um, fit_panorama, fit_scene
+from foveasim.camera._framing import Turn, axis_of, common_bounds_um, fit_panorama, fit_scene, turned_panorama
 from foveasim.camera._rates import expected_rates, footprints_at
 from foveasim.camera._steps import SensorFrame, capture_for_time, check_exposure, seconds_of, white_dn
 from foveasim.camera._video import rates_of_frames, video
@@ -48,7 +48,7 @@ from foveasim.scene._panorama import Panorama
 from foveasim.sensor import Footprints, NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET, PERCENTILE, TARGET
-from foveasim.units import um_from_nm, w_from_w_m2_um2
+from foveasim.units import um_from_m, um_from_nm, w_from_w_m2_um2
 
 if TYPE_CHECKING:
     from foveasim.twin import PictureComparison
@@ -305,7 +305,7 @@ class Camera:
         return self._frame([self, *others], scene, Turn())
 
     def _frame(self, cameras: Sequence[Camera], scene: Scene, turn: Turn | None) -> Scene:
-        """Return a scene with its pitch; in a panorama the camera turns, and without a turn its cells are 0."""
+        """Return a scene with its pitch; cells of a panorama are 0 without a turn."""
         framed = self._framed
         if len(cameras) == 1 and framed is not None and framed[0] is scene and turn in (framed[1], None):
             return framed[2]
@@ -386,7 +386,7 @@ class Camera:
         return self.fit_scene(light) if isinstance(light, Scene) else light
 
     def geometry_of(self, light: Scene | PowerMap) -> Scene | PowerMap:
-        """Return a scene with its pitch, whose pixels may be 0 if it is a panorama, or a power map."""
+        """Return a scene with its pitch, of a panorama with pixels of 0, or a power map."""
         if isinstance(light, Scene) and light.panorama is not None and light.pitch_um is None:
             return self._frame([self], light, None)
         return self._with_pitch(light)
@@ -450,6 +450,14 @@ class Camera:
         per_um = self.sensor_frame(scene).scale * self._optics.magnification(scene.distance_m)
         x_um, y_um = (np.array(scene.centre_um) - gaze / per_um).tolist()
         return scene.with_centre((x_um, y_um))
+
+    def seen_panorama(self, scene: Scene) -> Panorama:
+        """Return the panorama of a scene with the orientation at the gaze of the camera."""
+        assert scene.panorama is not None
+        projection, frame = self.projection(scene), self.sensor_frame(scene)
+        focal_um = self._optics.magnification(scene.distance_m) * float(um_from_m(scene.distance_m))
+        turn = self._turn(scene.panorama, self._gaze_um)
+        return turned_panorama(scene.panorama, self._distortion, projection, np.array(frame.axis_um), focal_um, turn)
 
     def _turn(self, panorama: Panorama, gaze_um: Position) -> Turn:
         """Return the turn of a camera in a panorama."""

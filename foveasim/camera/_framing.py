@@ -20,6 +20,7 @@ from foveasim.distortion._projected import directions_of
 from foveasim.errors import ParameterError
 from foveasim.optics import Optics
 from foveasim.scene import Scene
+from foveasim.scene._panorama import Panorama
 from foveasim.units import um_from_m
 
 if TYPE_CHECKING:
@@ -105,9 +106,9 @@ def fit_scene(scene: Scene, optics: Optics, lens: Lens | None, bounds_um: Floats
 
 class Turn(NamedTuple):
     """
-    Gaze of a camera that turns: a point of the sensor, in µm, or azimuth and elevation in degrees.
+    Gaze of a camera that turns.
 
-    At most one of them differs from (0, 0).
+    ``gaze_um`` is a point of the sensor, ``gaze_deg`` azimuth and elevation. At most one of them differs from (0, 0).
     """
 
     gaze_um: Position = (0.0, 0.0)
@@ -146,12 +147,18 @@ def fit_panorama(
     if turn is None:
         cells = np.broadcast_to(np.float32(0.0), (scene.basis.shape[0], n_y, n_x))
     else:
-        if any(turn.gaze_um):
-            panorama = panorama.towards(_gaze_direction(lens, projection, axis_um, focal_um, turn.gaze_um))
-        elif panorama.gaze_deg is None:
-            panorama = replace(panorama, gaze_deg=turn.gaze_deg)
-        cells = panorama.cell_means(scene.basis, projection, (n_y, n_x), pitch, n_threads)
+        seen = turned_panorama(panorama, lens, projection, axis_um, focal_um, turn)
+        cells = seen.cell_means(scene.basis, projection, (n_y, n_x), pitch, n_threads)
     return scene.resampled(cells, pitch * distance_um, frame.axis_um, projection)
+
+
+def turned_panorama(
+    panorama: Panorama, lens: Lens | None, projection: ImageProjection, axis_um: Floats, focal_um: float, turn: Turn
+) -> Panorama:
+    """Return a panorama as a camera sees it at its gaze."""
+    if any(turn.gaze_um):
+        return panorama.towards(_gaze_direction(lens, projection, axis_um, focal_um, turn.gaze_um))
+    return replace(panorama, gaze_deg=turn.gaze_deg) if panorama.gaze_deg is None else panorama
 
 
 def _gaze_direction(

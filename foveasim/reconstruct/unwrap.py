@@ -1,4 +1,4 @@
-"""Pictures of wide fields in other projections: panoramas and views of a sensor behind a lens model."""
+"""Pictures of wide fields as panorama, or as views in other projections."""
 
 from __future__ import annotations
 

@@ -192,6 +192,12 @@ class Panorama:
 
         parallel_map(fill, range(0, n_y, n_rows), n_threads)
 
+    def pixels_at(self, directions: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:
+        """Return rows and columns of directions (n, 3), from the lower left pixel."""
+        n_points = directions.shape[0]
+        u0, u1, v0, v1 = self._boxes(directions, np.full(n_points, 1e-9), (n_points, 1), shape)
+        return 0.5 * (v0 + v1) - 0.5, 0.5 * (u0 + u1) - 0.5
+
     def _row_weights(self, n_y: int) -> Floats:
         """Return the relative solid angle of the pixels of each row."""
         if self.mapping != "equirectangular":
