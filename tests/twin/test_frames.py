@@ -1,6 +1,7 @@
 """Sensors estimated from frames of a camera: recovery, coverage of intervals, files, and sensors afterwards."""
 
 import copy
+import dataclasses
 import pickle
 
 import numpy as np
@@ -339,6 +340,20 @@ def test_colours_of_a_mosaic_share_the_electronics():
     np.testing.assert_array_equal(channel[:2, :2], [[0, 1], [1, 2]])
     assert found.sensor(filters="rgb").n_filters == 3
     assert any("give filters" in text for text in found.assumptions)
+
+
+def test_colours_with_defects_are_independent():
+    """Classes of different numbers of pixels: a sensor without a mosaic has four equal colours, and the same parameters."""
+    sensor, adc = camera_of(4)
+    sensor = dataclasses.replace(sensor, hot_fraction=0.01, hot_e_per_s=5e3)
+    stacks, truth = stacks_of(sensor), truth_of(sensor)
+    one, four = (fs.twin.fit(stacks, pixel_um=3.0, mosaic=mosaic, **adc) for mosaic in (None, "RGGB"))
+    assert 0.0 < one.estimates["hot_fraction"].value == four.estimates["hot_fraction"].value
+
+    for name in ("gain_dn_per_e", "read_noise_e", "prnu_fraction"):
+        interval = four.estimates[name].high - four.estimates[name].low
+        assert four.estimates[name].value == pytest.approx(truth[name], abs=interval)
+        assert interval == pytest.approx(one.estimates[name].high - one.estimates[name].low, rel=0.5)
 
 
 def test_quantisation_hides_noise():

@@ -286,7 +286,9 @@ class _Model:
         """Return the map to uncorrelated statistics of variance 1, for noise and pixels."""
         from scipy.linalg import solve_triangular
 
-        matrix = moments.sampling() / np.tile(self.levels.n_pixels, 2) + self.common
+        n_pixels, classes = np.tile(self.levels.n_pixels, 2), np.tile(self.levels.class_of_level, 2)
+        sampling = moments.sampling() / np.sqrt(np.multiply.outer(n_pixels, n_pixels))
+        matrix = np.where(np.equal.outer(classes, classes), sampling, 0.0) + self.common
         matrix[np.diag_indices_from(matrix)] += self.noise(moments) + self.chain_errors(vector, moments)
         scale = np.sqrt(np.diag(matrix))
         factor = np.linalg.cholesky(matrix / np.multiply.outer(scale, scale))
