@@ -46,7 +46,7 @@ from foveasim.reconstruct import (
     to_cortical,
 )
 from foveasim.reconstruct.picture import PIXELS, Gaps
-from foveasim.reconstruct.unwrap import ViewProjection, unwrap
+from foveasim.reconstruct.unwrap import FIELD, ViewProjection, unwrap
 from foveasim.sensor import Sensor, signal_to_noise
 from foveasim.units import m_from_mm, um_from_m
 
@@ -255,8 +255,8 @@ class Capture:
         colour: Literal["corrected", "raw"] | None = None,
         sensor: Sensor | None = None,
         projection: ViewProjection | None = None,
-        field_of_view_deg: float | None = None,
-        towards_deg: OwnCheck[tuple[float, float]] = (0.0, 0.0),
+        field_of_view_deg: Annotated[float | None, FIELD] = None,
+        towards_deg: OwnCheck[tuple[float, float] | None] = None,
         lens: OwnCheck[Any] = None,
         **options: Any,
     ) -> Picture:
@@ -294,8 +294,8 @@ class Capture:
         projection : str, optional
             ``"equirectangular"``, ``"rectilinear"``, or another projection of :func:`foveasim.reconstruct.unwrap`, to which
             the picture is mapped through the lens model: panoramas and views of wide fields.
-        field_of_view_deg, towards_deg
-            With ``projection``, the field of the picture and the direction at its centre, from the optical axis.
+        field_of_view_deg, towards_deg : optional
+            With ``projection``, the field of the picture and the direction at its centre, by default the optical axis.
         lens : lens model of foveasim.distortion, optional
             With ``projection``, by default that of the camera.
         **options
@@ -331,8 +331,9 @@ class Capture:
         self._check_sensor(sensor)
         if projection is not None and grid is not None:
             raise ParameterError("grid", "must not be given with 'projection', which has its own pixels", grid)
-        if projection is None and lens is not None:
-            raise ParameterError("lens", "requires 'projection'", lens)
+        for name, value in (("lens", lens), ("field_of_view_deg", field_of_view_deg), ("towards_deg", towards_deg)):
+            if projection is None and value is not None:
+                raise ParameterError(name, "requires 'projection'", value)
         grid = raster_grid(self.layout, max_pixels) if grid is None else grid
         picture = self._reconstruct(method, grid, of, per, sensor, {"gaps": gaps, **options})
         matrix = self._colour_matrix(colour)
@@ -346,7 +347,7 @@ class Capture:
             self._lens_of_settings() if lens is None else lens,
             projection=projection,
             field_of_view_deg=field_of_view_deg,
-            towards_deg=towards_deg,
+            towards_deg=(0.0, 0.0) if towards_deg is None else towards_deg,
             max_pixels=max_pixels,
             position_um=(float(x_um), float(y_um)),
         )
