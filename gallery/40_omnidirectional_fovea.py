@@ -4,7 +4,7 @@ What does a foveal sensor see of everything around it, through one fisheye lens?
 New here: ``fs.Scene.from_panorama``, ``fs.Camera(gaze_deg=...)``,
 ``capture.picture(projection=...)``.
 
-Expect: 12,384 photosites over a field of 200°, half of them within 15° of the axis.
+Expect: 12,528 photosites over a field of 200°, half of them within 15° of the axis.
 Unwrapped pictures are sharp where the camera looks, and coarse at the sides and behind;
 windows are visible where the gaze is on them.
 """
@@ -24,7 +24,7 @@ from foveasim.view import save_figure
 FOCAL_UM, FIELD_DEG = 1000.0, 200.0
 #: Gazes: azimuth and elevation, degrees.
 GAZES_DEG = ((0.0, 0.0), (70.0, 12.0))
-N_SECTORS = 144
+N_SECTORS, R_MIN_UM = 144, 40.0
 #: Parameters for a test of the script.
 QUICK = {"n_y": 128, "n_sectors": 48}
 
@@ -62,10 +62,10 @@ def town(n_y: int) -> np.ndarray:
 
 def camera(n_sectors: int) -> fs.Camera:
     """Return a camera with a fisheye lens and a log-polar layout."""
+    r_max_um = FOCAL_UM * math.radians(0.5 * FIELD_DEG)
+    n_rings = round(n_sectors * math.log(r_max_um / R_MIN_UM) / (2.0 * math.pi))
     layout = fs.layout.log_polar(
-        n_sectors=n_sectors,
-        r_min_um=40.0,
-        r_max_um=FOCAL_UM * math.radians(0.5 * FIELD_DEG),
+        n_sectors=n_sectors, n_rings=n_rings, r_min_um=R_MIN_UM, r_max_um=r_max_um
     )
     return fs.Camera(
         optics=fs.Optics(focal_length_mm=FOCAL_UM / 1000.0, f_number=2.8),

@@ -91,7 +91,7 @@ def unwrap(
     ... )
     >>> view = fs.reconstruct.unwrap(picture, lens, max_pixels=64)
     >>> view.data.shape, round(float(np.isfinite(view.data).mean()), 2)
-    ((1, 32, 64), 0.53)
+    ((1, 32, 64), 0.57)
     """
     from scipy.ndimage import map_coordinates
 
