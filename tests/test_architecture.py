@@ -65,13 +65,13 @@ DIMENSIONLESS = {
 }  # fmt: skip
 #: Names in private functions, in cells, pitches, steps or aperture radii as their docstrings specify.
 INTERNAL = {
-    "log_mean", "parts", "nodes", "slopes", "variance_slope", "along_y", "at_points", "fields", "profiles", "at", "axes", "before", "blur_cells", "blur_lambda_n", "bound", "bounds", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "homography", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
+    "log_mean", "nodes", "slopes", "variance_slope", "along_y", "at_points", "fields", "profiles", "at", "axes", "before", "blur_cells", "blur_lambda_n", "bound", "bounds", "corners", "curve", "cycles", "diagonal", "edge", "extent", "fraction", "fractions", "homography", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
     "n_across", "n_source_cells", "moments", "new_radius", "node", "norm", "off_diagonal", "one", "other", "per_step", "pixel", "plane", "points", "quantiles", "r2", "radius", "right", "row", "rows", "s_x", "s_y", "scale", "screen", "side", "sigma", "slope", "spread", "start", "tables_at",
     "tangent2_x", "tangent2_y", "threshold", "to_step", "u", "upper", "v", "x", "x2", "xy", "y", "y2", "sampling", "step", "t", "weigh", "window",
     "across", "direction", "pitch", "u0", "u1", "v0", "v1", "error", "freedom", "covariance", "edges", "lines", "log_odds_error", "log_step_error", "names", "noise", "of_blocks", "of_pixels", "own_covariance", "probability", "residuals", "share", "square", "vector",
     "neutral", "primaries", "transfer",
     "bounds_db", "difference_db", "illumination", "spectra", "srgb", "white_xyz", "xyz", "centre", "centres", "circles", "column_x", "compute", "discs", "maps", "opening", "photodiode", "position", "half", "lines_x", "lines_y", "ordered", "phase", "radians", "radians_x", "rho", "row_y", "segments", "shift", "tangents",
-    "background", "changes", "cover", "shifts_cells", "transmittance",
+    "background", "changes", "cover", "response_noise", "rts_probability", "shifts_cells", "transmittance",
 }  # fmt: skip
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")
 

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.threads import cached_property
+from foveasim._core.threads import parallel_map
 from foveasim._core.validation import Bools, Floats, Images, Ints
 from foveasim._io.mapped_files import in_memory
 from foveasim._projections import ImageProjection
@@ -37,8 +37,12 @@ from foveasim.optics._imaging import MapRows
 if TYPE_CHECKING:
     from foveasim.fields import SceneLike
 
-#: Step of the blur radius between neighbouring pixels, in cells, above which a surface ends behind another one.
-STEP_CELLS = 1.5
+#: Step of the blur radius between neighbouring pixels, in cells, above which a surface ends behind another one; and the smaller
+#: step, which is an edge if it is at least so many times that of both adjacent pairs of pixels: else the surface is steep, or
+#: its distances are noisy.
+STEP_CELLS, MIN_STEP_CELLS, STEP_RATIO = 1.5, 0.5, 4.0
+#: Cells beyond the blur that a surface is continued.
+REACH_CELLS = 2.0
 #: Smallest sum of shares: a division by less would amplify rounding errors.
 MIN_SHARE = 1e-3
 #: Rows of maps that are composed together.
@@ -47,27 +51,56 @@ ROWS_TOGETHER = 64
 REFERENCE_RINGS, REFERENCE_POINTS = 12, 24
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layer:
-    """Pixels of a layer, ``number`` from near to far, which is imaged as if at a distance."""
+    """
+    Pixels of a layer, which is imaged as if at a distance.
 
-    number: int
+    ``visible`` (n,): flat indices of its pixels. ``hidden`` (m,): flat indices of pixels of nearer layers, behind which it
+    continues. ``rim`` (m,): flat indices of the pixels whose radiance it has there.
+    """
+
     distance_m: float
+    visible: Ints
+    hidden: Ints
+    rim: Ints
+
+    def rows(self, n_x: int) -> tuple[int, int]:
+        """
+        Return the range of rows that have pixels of the layer.
+
+        ``n_x``: number of columns of the picture.
+        """
+        ends = [pixels[[0, -1]] // n_x for pixels in (self.visible, self.hidden) if pixels.size]
+        return min(int(first) for first, _ in ends), max(int(last) for _, last in ends) + 1
+
+    def write(self, images: Images | None, out: NDArray[Any]) -> None:
+        """Write the pixels of the layer to images (n_basis, n_y, n_x) of 0, or its cover, 1."""
+        from foveasim.optics._kernels import copy_pixels
+
+        if images is None:
+            self.fill(out, 1.0)
+            return
+        for image, cells in zip(images, out, strict=True):
+            pixels = np.ascontiguousarray(in_memory(image)).reshape(-1)
+            copy_pixels(pixels, self.visible, self.visible, cells.reshape(-1))
+            copy_pixels(pixels, self.rim, self.hidden, cells.reshape(-1))
+
+    def fill(self, out: NDArray[Any], value: float) -> None:
+        """Write a value to the pixels of the layer."""
+        from foveasim.optics._kernels import fill_pixels
+
+        for cells in out:
+            for pixels in (self.visible, self.hidden):
+                fill_pixels(out.dtype.type(value), pixels, cells.reshape(-1))
 
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """
-    Layers of a picture with depth, from near to far.
-
-    ``layers``: those with pixels. ``visible`` (n_y, n_x): number of the layer of each pixel. ``hidden`` (n_y, n_x): number of
-    the layer behind it, -1 for none. ``rim`` (n_y, n_x): flat index of the pixel whose radiance continues there.
-    """
+    """Layers of a picture with depth, from near to far. ``shape``: (n_y, n_x) of the picture."""
 
     layers: Sequence[Layer]
-    visible: Ints
-    hidden: Ints
-    rim: Ints
+    shape: tuple[int, int]
 
     @classmethod
     def of(cls, depth_m: Floats, blur_cells_m: float, focus_m: float, max_layers: int | None) -> Layers:
@@ -85,30 +118,24 @@ class Layers:
         number = np.rint(nearest / step) - np.rint(radius / step)
         if max_layers is not None:
             number = np.minimum(number, max_layers - 1)
-        visible = number.astype(np.int32)
-        hidden, rim = _continued(radius, visible)
-        used = np.flatnonzero(np.bincount(visible.ravel()))
-        layers = [Layer(int(k), _distance_m(depth_m[visible == k], focus_m)) for k in used]
-        return cls(layers, visible, hidden, rim)
+        number = number.astype(np.int32)
+        behind, rim = _continued(radius, number)
+        is_hidden = behind.ravel() >= 0
+        hidden = np.flatnonzero(is_hidden)
+        visible_of, hidden_of = _sorted(number.ravel()), _sorted(behind.ravel()[hidden])
+        layers = []
+        for k, visible in visible_of.items():
+            continued = hidden[hidden_of.get(k, np.empty(0, np.intp))]
+            distance_m = _distance_m(depth_m.ravel()[visible], focus_m)
+            layers.append(Layer(distance_m, visible, continued, rim.ravel()[continued].astype(np.int64)))
+        return cls(layers, (depth_m.shape[0], depth_m.shape[1]))
 
-    def cover(self, layer: Layer, images: Images | None, real: Any) -> NDArray[Any]:
-        """Return the pixels of a layer, (n_basis, n_y, n_x), or its cover (1, n_y, n_x)."""
-        is_visible, behind = self.visible == layer.number, np.flatnonzero(self.hidden == layer.number)
-        if images is None:
-            found = is_visible[np.newaxis].astype(real)
-            found.reshape(1, -1)[:, behind] = 1.0
-            return found
-        found = np.zeros(images.shape, images.dtype)
-        for image, out in zip(images, found, strict=True):
-            pixels = in_memory(image)
-            np.copyto(out, pixels, where=is_visible)
-            out.ravel()[behind] = pixels.ravel()[self.rim.ravel()[behind]]
-        return found
 
-    @cached_property
-    def extremes_m(self) -> tuple[float, ...]:
-        """Distances of the nearest and the farthest layer."""
-        return tuple(sorted({self.layers[0].distance_m, self.layers[-1].distance_m}))
+def _sorted(number: Ints) -> dict[int, Ints]:
+    """Return the indices of each number that occurs, in ascending order."""
+    order = np.argsort(number, kind="stable")
+    found, first = np.unique(number[order], return_index=True)
+    return dict(zip(found.tolist(), np.split(order, first[1:]), strict=True)) if number.size else {}
 
 
 def _distance_m(depth_m: Floats, focus_m: float) -> float:
@@ -124,20 +151,23 @@ def _distance_m(depth_m: Floats, focus_m: float) -> float:
 def _continued(radius: Floats, visible: Ints) -> tuple[Ints, Ints]:
     """Return the layer behind each pixel, and the pixel at whose rim its surface ends."""
     is_rim = np.zeros(radius.shape, bool)
-    for axis in (0, 1):
-        ahead = np.diff(radius, axis=axis) > STEP_CELLS  # the next pixel is nearer
-        behind = np.diff(radius, axis=axis) < -STEP_CELLS
-        low, high = [slice(None)] * 2, [slice(None)] * 2
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        is_rim[tuple(low)] |= ahead
-        is_rim[tuple(high)] |= behind
+    for along, rims in ((radius, is_rim), (radius.T, is_rim.T)):
+        step = np.diff(along, axis=1)  # > 0: the next pixel is nearer
+        size = np.pad(np.abs(step), ((0, 0), (1, 1)))
+        slope = np.maximum(size[:, :-2], size[:, 2:])
+        is_edge = size[:, 1:-1] > np.minimum(STEP_CELLS, np.maximum(MIN_STEP_CELLS, STEP_RATIO * slope))
+        rims[:, :-1] |= is_edge & (step > 0.0)
+        rims[:, 1:] |= is_edge & (step < 0.0)
     if not is_rim.any():
         return np.full(radius.shape, -1, np.int32), np.zeros(radius.shape, np.int32)
     from scipy.ndimage import distance_transform_edt
 
-    at_y, at_x = distance_transform_edt(~is_rim, return_distances=False, return_indices=True)
+    distance, (at_y, at_x) = distance_transform_edt(~is_rim, return_indices=True)
     rim = at_y * radius.shape[1] + at_x
-    is_behind: Bools = radius - radius.ravel()[rim] > STEP_CELLS
+    of_rim_cells = radius.ravel()[rim]
+    # Light of the hidden surface arrives within the blur of both.
+    is_near = distance < np.abs(radius) + np.abs(of_rim_cells) + REACH_CELLS
+    is_behind: Bools = is_near & (radius - of_rim_cells > MIN_STEP_CELLS)
     of_rim = visible.ravel()[rim]
     return np.where(is_behind & (of_rim > visible), of_rim, np.int32(-1)), rim
 
@@ -154,9 +184,10 @@ class LayerLight:
     centre_um: tuple[float, float]
     distance_m: float
     projection: ImageProjection
+    lit_rows: tuple[int, int]
 
     @classmethod
-    def of(cls, scene: SceneLike, images: Images, spectrum_w_m2_sr_nm: Floats) -> LayerLight:
+    def of(cls, scene: SceneLike, layer: Layer, images: Images, spectrum_w_m2_sr_nm: Floats) -> LayerLight:
         """Return images of a layer with the geometry and the bands of a scene."""
         return cls(
             images,
@@ -167,6 +198,7 @@ class LayerLight:
             scene.centre_um,
             scene.distance_m,
             scene.projection,
+            layer.rows(images.shape[2]),
         )
 
 
@@ -182,7 +214,13 @@ def mean_spectrum(scene: SceneLike) -> Floats:
 
 
 def composed_maps(
-    scene: SceneLike, layers: Layers, maps_of: MapsOfLayer, cover: Floats, shape: tuple[int, int], real: Any
+    scene: SceneLike,
+    layers: Layers,
+    maps_of: MapsOfLayer,
+    cover: Floats,
+    shape: tuple[int, int],
+    real: Any,
+    n_threads: int,
 ) -> NDArray[Any]:
     """
     Return the maps (n_output, n_y, n_x) of layers that cover each other.
@@ -190,25 +228,41 @@ def composed_maps(
     Relative illumination is not applied. The spectra of one layer are in memory at a time. ``cover`` (n_output,): outputs for
     the mean spectrum of the scene.
     """
+    from foveasim.optics._kernels import add_layer
+
     total, left = np.zeros((cover.size, *shape), real), np.ones((cover.size, *shape), real)
     white = mean_spectrum(scene)[np.newaxis]
+    pixels, covers = np.zeros(scene.basis.shape, scene.basis.dtype), np.zeros((1, *layers.shape), real)
+    blocks = range(0, shape[0], ROWS_TOGETHER)
+    is_filled = np.zeros((cover.size, len(blocks)), bool)
     for layer in layers.layers:
-        covers = maps_of(LayerLight.of(scene, layers.cover(layer, None, real), white), layer, True)
-        pixels = layers.cover(layer, scene.basis, real)
-        lights = maps_of(LayerLight.of(scene, pixels, scene.spectrum_w_m2_sr_nm), layer, False)
-        for c, (rows_of_cover, rows_of_light) in enumerate(zip(covers, lights, strict=True)):
+        layer.write(None, covers)
+        layer.write(scene.basis, pixels)
+        of_cover = maps_of(LayerLight.of(scene, layer, covers, white), layer, True)
+        of_light = maps_of(LayerLight.of(scene, layer, pixels, scene.spectrum_w_m2_sr_nm), layer, False)
+        for c, (rows_of_cover, rows_of_light) in enumerate(zip(of_cover, of_light, strict=True)):
             if cover[c] == 0.0:
                 continue
-            for first in range(0, shape[0], ROWS_TOGETHER):
-                last = min(first + ROWS_TOGETHER, shape[0])
-                share = rows_of_cover(first, last) * real(1.0 / cover[c])
-                part, room = rows_of_light(first, last), left[c, first:last]
-                # A cover within the room keeps its light as it is, rounding errors included, which conserves energy.
-                filled = np.minimum(share, room)
-                part *= np.divide(filled, share, out=np.ones_like(share), where=share > room)
-                total[c, first:last] += part
-                room -= filled
-    total /= np.maximum(1.0 - left, real(MIN_SHARE))
+
+            def add(
+                first: int, c: int = c, rows_of_cover: MapRows = rows_of_cover, rows_of_light: MapRows = rows_of_light
+            ) -> None:
+                last, block = min(first + ROWS_TOGETHER, shape[0]), first // ROWS_TOGETHER
+                if not is_filled[c, block]:
+                    share, light = rows_of_cover(first, last), rows_of_light(first, last)
+                    is_filled[c, block] = add_layer(
+                        share, light, real(1.0 / cover[c]), total[c, first:last], left[c, first:last]
+                    )
+
+            parallel_map(add, blocks, n_threads)
+        layer.fill(covers, 0.0)
+        layer.fill(pixels, 0.0)
+
+    def divide(first: int) -> None:
+        rows = slice(first, first + ROWS_TOGETHER)
+        total[:, rows] /= np.maximum(1.0 - left[:, rows], real(MIN_SHARE))
+
+    parallel_map(divide, blocks, n_threads)
     return total
 
 
@@ -216,10 +270,17 @@ def fine_pixels(layers: Layers, n_fine: int) -> Layers:
     """Return the layers of pixels that are divided into n x n cells."""
     if n_fine == 1:
         return layers
-    visible, hidden = (np.repeat(np.repeat(each, n_fine, 0), n_fine, 1) for each in (layers.visible, layers.hidden))
-    row, column = (n_fine * part for part in np.divmod(layers.rim, layers.rim.shape[1]))
-    rim = row * visible.shape[1] + column
-    return Layers(layers.layers, visible, hidden, np.repeat(np.repeat(rim, n_fine, 0), n_fine, 1))
+    n_y, n_x = layers.shape
+
+    def cells_of(pixels: Ints) -> Ints:
+        row, column = (n_fine * part[:, np.newaxis] + np.arange(n_fine) for part in np.divmod(pixels, n_x))
+        return np.asarray(n_fine * n_x * row[:, :, np.newaxis] + column[:, np.newaxis]).reshape(-1)
+
+    fine = [
+        Layer(each.distance_m, *(cells_of(part) for part in (each.visible, each.hidden, each.rim)))
+        for each in layers.layers
+    ]
+    return Layers(fine, (n_fine * n_y, n_fine * n_x))
 
 
 def reference_map(
@@ -243,8 +304,10 @@ def reference_map(
     weight = transmittance(points)
     parts = []
     for layer in layers.layers:
-        cover = layers.cover(layer, None, np.float64)[0]
-        parts.append((cover, layers.cover(layer, images, np.float64)[0], shifts_cells(layer, points)))
+        both = np.zeros((2, *layers.shape))
+        layer.write(None, both[:1])
+        layer.write(images, both[1:])
+        parts.append((*both, shifts_cells(layer, points)))
     total, total_weight = np.zeros(images.shape[1:]), np.zeros(images.shape[1:])
     for k in np.flatnonzero(weight):
         light, left = np.zeros(images.shape[1:]), np.ones(images.shape[1:])

@@ -117,6 +117,8 @@ class Imaging:
     real: type[np.floating[Any]]
     n_threads: int
     cached_factor: FactorLookup
+    # First and last row of the picture outside which all basis images are 0.
+    lit_rows: tuple[int, int] | None = None
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
@@ -170,7 +172,9 @@ class Imaging:
             b, mode = divmod(b, 1 + len(self.field_weights))
             weights = [*self.illumination, *(self.field_weights[mode - 1 : mode] if mode else ())]
             image = in_memory(self.basis[b])
-            transform.forward(image, self.tangent2_x, self.tangent2_y, self.falloff_power, out, weights, after)
+            transform.forward(
+                image, self.tangent2_x, self.tangent2_y, self.falloff_power, out, weights, after, self.lit_rows
+            )
 
         return self._maps(transform, write_spectrum, lambda weight: self.cached_factor(weight, transform, table_of))
 
@@ -200,6 +204,13 @@ class Imaging:
             return sums
 
         def sum_step(group: Group, step: Step) -> NDArray[Any]:
+            if transform.is_filtered_by_blocks and step.basis.size == step.outputs.size == len(group.steps) == 1:
+                # The map overwrites each block of the spectrum while it is in the cache of a core.
+                spectra = transform.spectra(1)
+                write_spectrum(
+                    int(step.basis[0]), spectra[0], filtering(spectra, step, spectra, is_first=True, is_last=True)
+                )
+                return spectra
             if step is group.steps[0]:
                 stored[group] = transform.spectra(group.basis.size)
                 for spectrum, b in zip(stored[group], group.basis, strict=True):

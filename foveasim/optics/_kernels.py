@@ -374,6 +374,43 @@ def filter_and_sum(lines, factors, coefficients, first, is_added, out):
                 total[:] = 0.0
 
 
+@njit([types.void(array_of(r), INTS, INTS, r[::1]) for _, r in _PAIRS])
+def copy_pixels(values, source, target, out):
+    """Write ``out[target] = values[source]``."""
+    for k in range(target.size):
+        out[target[k]] = values[source[k]]
+
+
+@njit([types.void(r, INTS, r[::1]) for _, r in _PAIRS])
+def fill_pixels(value, target, out):
+    """Write ``out[target] = value``."""
+    for k in range(target.size):
+        out[target[k]] = value
+
+
+@njit([types.boolean(r[:, ::1], r[:, ::1], r, r[:, ::1], r[:, ::1]) for _, r in _PAIRS])
+def add_layer(share, light, scale, total, left):
+    """
+    Add rows of a layer to a map, and fill what nearer layers have left of the pupil.
+
+    ``share`` times ``scale`` is the part of the pupil that the layer would fill alone, and ``light`` its irradiance then. A
+    share within what is left keeps its light as it is, rounding errors included, which conserves energy. Returns whether
+    nothing is left in any cell.
+    """
+    is_filled = True
+    for iy in range(total.shape[0]):
+        for ix in range(total.shape[1]):
+            alone, room, value = share[iy, ix] * scale, left[iy, ix], light[iy, ix]
+            if alone > room:
+                total[iy, ix] += value * (room / alone)
+                left[iy, ix] = room - room
+            else:
+                total[iy, ix] += value
+                left[iy, ix] = room - alone
+                is_filled &= room == alone
+    return is_filled
+
+
 @njit(
     types.void(
         array_of(types.complex128, 2),

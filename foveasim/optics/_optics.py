@@ -21,7 +21,7 @@ from foveasim._core.validation import Bools, Floats, check_number, check_point, 
 from foveasim.errors import ParameterError, SamplingWarning, warn
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.incidence import N_RINGS, N_RINGS_OF_PUPILS, ChiefRayTable, Incidence, cone_irradiance_sr
-from foveasim.optics._aperture import Aperture, PSFModel, Wavefront, overlaps
+from foveasim.optics._aperture import ACROSS_PER_BLUR, MAX_ACROSS, Aperture, PSFModel, Wavefront, overlaps
 from foveasim.optics._illumination import IlluminationTable, solid_angles_sr
 from foveasim.optics._point_images import Point, PointImages
 from foveasim.optics.aberrations import LateralColour, Seidel, Zernike
@@ -590,8 +590,7 @@ class Optics(PointImages):
         ParameterError
             When the scene is not a Scene or is too near, the pupil is empty, or the aberrations exceed the largest blur.
         """
-        grid, depths_m = self.grid(scene), _depth_range_m(scene)
-        is_deep = depths_m is not None and depths_m[0] < depths_m[1]
+        grid, is_deep = self.grid(scene), depth_of(scene) is not None
         for aperture in self._extreme_apertures(scene):
             if aperture.is_clear_circle or (
                 is_deep and isinstance(aperture, Aperture) and aperture.is_defocused_circle
@@ -768,7 +767,7 @@ class Optics(PointImages):
 
         lens = self._focused(scene)
         layers = lens._layers(scene)  # noqa: SLF001 -- same class
-        if len(layers.layers) == 1:
+        if len(layers.layers) == 1 and lens._is_of_planes(scene, layers.layers[0].distance_m):  # noqa: SLF001
             yield from lens._plane_maps(scene, weights, grid, n_threads, layers.layers[0].distance_m)  # noqa: SLF001
             return
 
@@ -777,10 +776,18 @@ class Optics(PointImages):
             return lens._plane_maps(light, weights, grid, n_threads, layer.distance_m, part)  # noqa: SLF001
 
         white = lens._on_axis_w_m2(scene, mean_spectrum(scene)[np.newaxis], grid)[0]  # noqa: SLF001
-        maps = composed_maps(scene, layers, maps_of, weights @ white, grid.shape, self._real_type())
+        maps = composed_maps(scene, layers, maps_of, weights @ white, grid.shape, self._real_type(), n_threads)
         lens._apply_illumination(maps, scene, grid)  # noqa: SLF001
         for complete in maps:
             yield partial(rows_of, complete)
+
+    def _is_of_planes(self, scene: SceneLike, object_m: float) -> bool:
+        """Return whether the defocus at a distance is within the limit of scenes that are planes."""
+        aperture = self._aperture(object_m)
+        if not (isinstance(aperture, Aperture) and aperture.is_defocused_circle):
+            return True
+        blur = max(aperture.blur_lambda_n(wave_nm, (0.0, 0.0)) for wave_nm in scene.wavelength_nm.tolist())
+        return blur * ACROSS_PER_BLUR <= MAX_ACROSS
 
     def _write_reference(self, scene: SceneLike, grid: Grid, data: NDArray[Any]) -> None:
         """Write maps of a scene with depth by rays through points of the pupil."""
@@ -819,9 +826,9 @@ class Optics(PointImages):
         if self.psfs is not None:
             raise ParameterError(
                 "psfs",
-                "must not be given for a scene with depth, since sampled PSFs do not change with the distance",
+                "must not be given for a scene with depth: PSFs sampled at one distance do not determine those at others",
                 self.psfs,
-                hint="use 'pupil', 'zernike' or 'seidel', or a scene without depth",
+                hint="pass the Zernike coefficients of the design as 'zernike', since a wavefront can be defocused",
             )
         focus_m = scene.distance_m if self.focus_distance_m is None else self.focus_distance_m
 
@@ -987,6 +994,7 @@ class Optics(PointImages):
             real=self._real_type(),
             n_threads=n_threads,
             cached_factor=cached_factor,
+            lit_rows=getattr(scene, "lit_rows", None),
         )
 
         def tables_at(field_um: tuple[float, float]) -> Tables:

@@ -220,17 +220,22 @@ class Transform:
         out: NDArray[Any],
         weights: Sequence[FieldWeight] = (),
         after: Callable[[int, int], None] | None = None,
+        lit_rows: tuple[int, int] | None = None,
     ) -> None:
         """
         Write the spectrum of a padded picture with relative illumination and weights.
 
-        ``after``: called with (first, last) of each block of columns while it is in the cache of a core.
+        ``after``: called with (first, last) of each block of columns while it is in the cache of a core. ``lit_rows``: first
+        and last row outside which the picture is 0.
         """
         (n_y, _), (top, left) = self._picture_shape, self._n_before
         x2, y2 = x2.astype(self._real), y2.astype(self._real)
         along_y, profiles = _stacked(weights, self._picture_shape, self._real)
 
+        begin, end = (0, n_y) if lit_rows is None else lit_rows
+
         def transform_rows(first: int, last: int) -> None:
+            first, last = begin + first, begin + last
             padded = np.empty((last - first, self._columns.size), self._real)
             rows, of_rows = np.ascontiguousarray(image[first:last]), np.ascontiguousarray(along_y[:, first:last])
             self._kernels.apply_falloff(
@@ -240,12 +245,13 @@ class Transform:
 
         def transform_columns(first: int, last: int) -> None:
             lines = out[first:last]
+            lines[:, top : top + begin] = lines[:, top + end : top + n_y] = 0.0
             self._kernels.pad_lines(self._rows, top, n_y, lines)
             _in_place(scipy.fft.fft, lines)
             if after is not None:
                 after(first, last)
 
-        self._for_each_block(transform_rows, n_y, ROWS_PER_BLOCK)
+        self._for_each_block(transform_rows, end - begin, ROWS_PER_BLOCK)
         self._for_each_block(transform_columns, out.shape[0], COLUMNS_PER_BLOCK)
         if not np.isfinite(out[0, 0]):
             raise SimulationError("the scene must be finite, got NaN or infinite values; mask or replace them")
@@ -346,13 +352,19 @@ class Transform:
         n_y, n_x = self.map_shape
         top, left = (self._oversample * before for before in self._n_before)
         n_rows = (n_y if last_row is None else last_row) - first_row
-        image = work_array((n_rows, n_x), self._real)
 
-        def transform_rows(first: int, last: int) -> None:
+        def transformed(first: int, last: int) -> NDArray[Any]:
             rows = np.empty((last - first, lines.shape[0]), lines.dtype)
             self._kernels.load_rows(lines, top + first_row + first, rows)
             padded = scipy.fft.irfft(rows, n=self._oversample * self._columns.size, axis=1, overwrite_x=True)
-            image[first:last] = padded[:, left : left + n_x]
+            return padded[:, left : left + n_x]
+
+        if n_rows <= ROWS_PER_BLOCK:
+            return np.ascontiguousarray(transformed(0, n_rows))
+        image = work_array((n_rows, n_x), self._real)
+
+        def transform_rows(first: int, last: int) -> None:
+            image[first:last] = transformed(first, last)
 
         self._for_each_block(transform_rows, n_rows, ROWS_PER_BLOCK)
         return image

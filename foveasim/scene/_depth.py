@@ -4,9 +4,12 @@ Distances of the pixels of a picture: files, their units, and pixels without a d
 Distances are those along the optical axis, as depth cameras and stereo pairs state them, in m.
 
 Sources: N. Silberman, D. Hoiem, P. Kohli, R. Fergus, Indoor segmentation and support inference from RGBD images, ECCV (2012),
-and its toolbox (``depth_rel2depth_abs.m``); D. Scharstein et al., High-resolution stereo datasets with subpixel-accurate ground
-truth, GCPR (2014), and the format of ``calib.txt``; J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems,
-IROS (2012), format of depth pictures.
+and the functions ``depth_rel2depth_abs.m`` and ``camera_params.m`` of its toolbox; J. H. Lee et al., From big to small:
+multi-scale local planar guidance for monocular depth estimation, arXiv:1907.10326 (2019), whose pictures of the depth of NYU
+Depth v2 are in millimetres; D. Scharstein et al., High-resolution stereo datasets with subpixel-accurate ground truth, GCPR
+(2014), and the description of ``calib.txt`` on the page of the data; J. Sturm et al., A benchmark for the evaluation of RGB-D
+SLAM systems, IROS (2012), and the page of its file formats; Technical introduction to OpenEXR (channel Z: the distance of a
+sample from the viewer, whose unit and direction it leaves open).
 """
 
 from __future__ import annotations
@@ -34,7 +37,8 @@ DepthFormat: TypeAlias = Literal["mm", "nyu", "nyu_raw", "tum", "middlebury"]
 Missing: TypeAlias = Literal["raise", "far", "nearest"]
 #: Metres per stored value.
 SCALES_M: dict[str, float] = {"mm": 1e-3, "nyu": 1e-3, "tum": 1.0 / 5000.0}
-#: Raw values d of NYU Depth v2, with swapped bytes, are disparities of the Kinect: 351.3 / (1092.5 - d) m, at most 10 m.
+#: Raw values d of NYU Depth v2, with swapped bytes, are disparities of the Kinect: 351.3 / (1092.5 - d) m, set to 10 m if they
+#: are more.
 NYU_NUMERATOR_M, NYU_OFFSET, NYU_FARTHEST_M = 351.3, 1092.5, 10.0
 #: Numbers of a calibration of Middlebury: ``cam0=[f 0 cx; 0 f cy; 0 0 1]``, ``doffs=...`` in pixels, ``baseline=...`` in mm.
 CALIBRATION = re.compile(r"^\s*(cam0|doffs|baseline)\s*=\s*\[?\s*([-+0-9.eE]+)", re.MULTILINE)
@@ -120,9 +124,10 @@ def _in_m(
     if depth_format is None:
         return stored
     if depth_format == "nyu_raw":
-        # The toolbox limits distances to 10 m, and the Kinect states 2047 for pixels without one.
-        is_measured = (stored > 0.0) & (stored < NYU_OFFSET - NYU_NUMERATOR_M / NYU_FARTHEST_M)
-        return np.where(is_measured, NYU_NUMERATOR_M / np.where(is_measured, NYU_OFFSET - stored, 1.0), 0.0)
+        # The Kinect states 2047 for pixels without a distance, for which the formula is negative; the toolbox then returns 0.
+        is_measured = (stored > 0.0) & (stored < NYU_OFFSET)
+        found_m = NYU_NUMERATOR_M / np.where(is_measured, NYU_OFFSET - stored, 1.0)
+        return np.where(is_measured, np.minimum(found_m, NYU_FARTHEST_M), 0.0)
     if depth_format == "middlebury":
         assert calibration is not None
         focal, offset, baseline_mm = _calibration(Path(calibration))

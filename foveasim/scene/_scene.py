@@ -255,6 +255,8 @@ class Scene:
         if self.is_rgb and basis.shape[0] != len(RGB_NM):
             raise ParameterError("is_rgb", f"requires three basis images, got {basis.shape[0]}")
         if self.depth_m is not None:
+            if self.panorama is not None or self.projection != "rectilinear":
+                raise ParameterError("depth_m", "must not be given for a panorama, but for a picture of a plane")
             object.__setattr__(self, "depth_m", frozen_array(check_depth(self.depth_m, basis.shape[1:])))
         elif self.depth_layers is not None:
             raise ParameterError("depth_layers", "requires 'depth_m'", self.depth_layers)
@@ -749,9 +751,9 @@ class Scene:
         depth_scale : float, optional, m
             Distance of the value 1 in ``depth_m``, such as 0.001 for millimetres; 1 for arrays by default.
         depth_format : {"mm", "nyu", "nyu_raw", "tum", "middlebury"}, optional
-            Convention of the values instead of a scale: millimetres in integers, as in pictures of the depth of NYU Depth v2
-            (``"nyu"``); raw values d of that set, ``351.3 / (1092.5 - d)`` m; 5000 per metre (TUM); disparities d of Middlebury
-            2014, ``baseline f / (d + doffs)``.
+            Convention of the values instead of a scale: millimetres in integers, as in the usual pictures of NYU Depth v2
+            (``"nyu"``); raw values d of that set, ``351.3 / (1092.5 - d)`` m and at most 10 m, as in its toolbox; 5000 per
+            metre (TUM RGB-D); disparities d of Middlebury 2014, ``baseline f / (d + doffs)``, infinite where unknown.
         calibration : path, optional
             File ``calib.txt`` of the disparities of Middlebury.
         missing : {"raise", "far", "nearest"}
@@ -776,6 +778,10 @@ class Scene:
         The lens blurs a point at the distance H over a disc of the radius ``a D |1/H - 1/H_focus|``, with the pupil radius a
         and the image distance D, in addition to diffraction and aberrations. Near objects cover far ones; what they hide is
         the far surface at their rim, continued.
+
+        Units of files: Silberman et al., ECCV (2012), ``depth_rel2depth_abs.m``; Sturm et al., IROS (2012); Scharstein et
+        al., GCPR (2014). The channel Z of EXR is the distance from the viewer; renderers differ in whether it is that along
+        the axis or along the ray, which must be multiplied by the cosine of its angle.
 
         Examples
         --------

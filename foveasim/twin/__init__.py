@@ -14,8 +14,8 @@ from __future__ import annotations
 from foveasim._core.calls import publish
 from foveasim.twin.events.pixels import EventPixelFit, fit_event_pixels
 from foveasim.twin.events.recordings import StaticRecording, StepResponses
+from foveasim.twin.fitting.intervals import Estimate
 from foveasim.twin.frames.camera_fit import fit
-from foveasim.twin.frames.intervals import Estimate
 from foveasim.twin.frames.result import Twin, read_twin
 from foveasim.twin.frames.stacks import Stack, read_stacks
 from foveasim.twin.pictures.comparison import Deviation, PictureComparison, compare_with

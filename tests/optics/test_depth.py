@@ -60,20 +60,30 @@ def test_constant_depth_equals_plane_scene():
         np.testing.assert_array_equal(optics.power_map(same).data, optics.power_map(plane).data)
 
 
-def test_near_edge_equals_closed_form():
-    """A half plane, blurred over a disc of 840 λN, in front of an even background in focus."""
-    n, radius_cells, cell_um = 96, 12.0, 40.0
+def share_of_disc(edges, radius):
+    """Return means over cells of the share of a disc on the near side of an edge, (acos s - s sqrt(1 - s²)) / π."""
+    s = np.clip(edges / radius, -1.0, 1.0)
+    integral = (s * np.arccos(s) - np.sqrt(1.0 - s * s) * (2.0 + s * s) / 3.0) / np.pi  # over s from 1
+    integral += np.minimum(edges / radius + 1.0, 0.0)  # 1 beyond the disc
+    return radius * np.diff(integral) / np.diff(edges)
+
+
+@pytest.mark.parametrize("radius_cells", [0.55, 0.9, 1.3, 3.0, 12.0, 30.0])
+@pytest.mark.parametrize("is_background_sharp", [True, False])
+def test_near_edge_equals_closed_form(radius_cells, is_background_sharp):
+    """A half plane, blurred over a disc of 840 λN, in front of an even background."""
+    n, cell_um = 96 if radius_cells < 20.0 else 192, 480.0 / radius_cells
     is_near = np.arange(n) < n // 2
-    depth_m = np.where(is_near, depth_of_blur_m(radius_cells * cell_um / CELL_UM), FOCUS_M) * np.ones((24, 1))
-    picture = np.where(is_near, 1.0, 0.25) * np.ones((24, 1))
+    far_m = FOCUS_M if is_background_sharp else np.inf
+    depth_m = np.where(is_near, depth_of_blur_m(480.0 / CELL_UM), far_m) * np.ones((8, 1))
+    picture = np.where(is_near, 1.0, 0.25) * np.ones((8, 1))
     scene = scene_of(picture, depth_m).with_pitch(scene_of(picture, depth_m).pitch_um * cell_um / CELL_UM)
 
-    line = lens(source_pixel="square", oversample=2).power_map(scene).data[0, 24]
+    line = lens(source_pixel="square", oversample=2).power_map(scene).data[0, 8]
 
-    share = (line / line[-30] - 1.0) / 3.0
-    s = np.clip(((np.arange(2 * n) + 0.5) / 2.0 - n // 2) / radius_cells, -1.0, 1.0)
-    expected = (np.arccos(s) - s * np.sqrt(1.0 - s * s)) / np.pi
-    np.testing.assert_allclose(share, expected, atol=1e-3)
+    edges = np.arange(2 * n + 1) / 2.0 - n // 2
+    expected = share_of_disc(edges, radius_cells)
+    np.testing.assert_allclose((line / line[-n // 2] - 1.0) / 3.0, expected, atol=1.1e-3)
 
 
 def test_defocused_otf_equals_quadrature():
@@ -106,7 +116,7 @@ def test_relative_illumination_is_that_of_sensor():
     np.testing.assert_allclose(even, even.mean(), rtol=1e-9)
 
 
-@pytest.mark.parametrize("radius_cells", [-6.0, -0.5, 0.0, 3.0, 8.0])
+@pytest.mark.parametrize("radius_cells", [-6.0, -0.3, 0.0, 0.3, 3.0, 30.0])
 @pytest.mark.parametrize("is_alone", [True, False])
 def test_point_keeps_its_energy(radius_cells, is_alone):
     """At every distance, alone or in front of a dark background."""

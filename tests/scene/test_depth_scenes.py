@@ -3,6 +3,8 @@
 import pickle
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,6 +60,8 @@ def test_missing_distances_are_explicit():
         ("nyu", 1500, 1.5),
         ("tum", 5000, 1.0),  # "a pixel value of 5000 in the depth image corresponds to a distance of 1 meter"
         ("nyu_raw", 800, 1.2010),  # 351.3 / 292.5
+        ("nyu_raw", 1057, 9.8958),
+        ("nyu_raw", 1084, 10.0),  # the limit of the toolbox, camera_params.m
     ],
 )
 def test_conventions_of_integers(tmp_path, convention, stored, expected_m):
@@ -66,6 +70,13 @@ def test_conventions_of_integers(tmp_path, convention, stored, expected_m):
     found = distances_of(str(tmp_path / "depth.png"), shape=(4, 4), depth_format=convention)
 
     np.testing.assert_allclose(found, expected_m, rtol=1e-4)
+
+
+def test_nyu_pictures_agree_with_raw_values():
+    """A raw value of 600 is the nearest that the toolbox keeps, 0.71 m."""
+    raw = distances_of(np.array([[600]]), depth_format="nyu_raw")
+    assert raw[0, 0] == pytest.approx(0.7133, abs=1e-4)
+    assert distances_of(np.array([[713]], np.uint16), depth_format="nyu")[0, 0] == pytest.approx(raw[0, 0], abs=1e-3)
 
 
 def test_raw_value_without_distance_is_missing():
@@ -83,6 +94,24 @@ def test_middlebury_disparities_follow_calibration(tmp_path):
 
     assert found[0, 0] == pytest.approx(1e-3 * 193.001 * 3979.911 / 224.343, rel=1e-12)
     assert found[0, 1] == np.inf
+
+
+def test_pfm_of_middlebury_is_read(tmp_path):
+    """Rows of PFM start at the bottom; calib.txt is that of the scene Motorcycle."""
+    disparity = np.array([[100.0, np.inf, 50.0], [200.0, 100.0, np.inf]], "<f4")
+    (tmp_path / "disp0.pfm").write_bytes(b"Pf\n3 2\n-1.0\n" + disparity[::-1].tobytes())
+    (tmp_path / "calib.txt").write_text(
+        "cam0=[3979.911 0 1244.772; 0 3979.911 1019.507; 0 0 1]\n"
+        "cam1=[3979.911 0 1369.115; 0 3979.911 1019.507; 0 0 1]\n"
+        "doffs=124.343\nbaseline=193.001\nwidth=2964\nheight=2000\nndisp=280\nisint=0\nvmin=31\nvmax=257\n"
+    )
+
+    found = distances_of(
+        str(tmp_path / "disp0.pfm"), shape=(2, 3), depth_format="middlebury",
+        calibration=tmp_path / "calib.txt", missing="far",
+    )  # fmt: skip
+
+    np.testing.assert_allclose(found, [[3.42389, np.inf, 4.40584], [2.36825, 3.42389, np.inf]], rtol=1e-5)
 
 
 def test_depth_channel_of_exr_is_read(tmp_path):
@@ -136,7 +165,8 @@ def test_sampled_psfs_are_refused_with_depth():
     spot = np.exp(-0.5 * np.add.outer(np.arange(-8, 9) ** 2, np.arange(-8, 9) ** 2))
     psfs = fs.optics.PSFGrid.from_arrays(spot, x_um=0.0, y_um=0.0, wavelength_nm=550.0, pitch_um=1.0)
 
-    with pytest.raises(ParameterError, match="'psfs' must not be given for a scene with depth"):
+    sentence = "'psfs' must not be given for a scene with depth: PSFs sampled .* pass the Zernike coefficients"
+    with pytest.raises(ParameterError, match=sentence):
         camera(psfs=psfs).predict(fs.Scene.from_rgbd(*disc_before_wall(), **LIGHT), exposure_s=0.01)
 
 
@@ -196,6 +226,75 @@ def test_video_follows_depth_of_each_frame():
 
     np.testing.assert_array_equal(moved.code, alone.code)
     assert (still.expected_e != moved.expected_e).any()
+
+
+def test_frames_of_video_have_depth_of_template():
+    picture, depth_m = disc_before_wall()
+    template = fs.Scene.from_rgbd(picture, depth_m, **LIGHT)
+
+    (frame,) = fs.video.FrameSource([picture[::-1]], template=template, encoding="linear")
+
+    np.testing.assert_array_equal(frame.depth_m, template.depth_m)
+    with pytest.raises(ParameterError, match="'depth_m' must have the shape of the picture"):
+        next(iter(fs.video.FrameSource([picture[:20]], template=template, encoding="linear")))
+
+
+def test_threads_and_processes_agree():
+    scene, cam = fs.Scene.from_rgbd(*disc_before_wall(), **LIGHT), camera(focus_distance_m=0.5)
+    expected = cam.predict(scene, exposure_s=0.01)[0]
+
+    with ThreadPoolExecutor(3) as pool:
+        found = list(pool.map(lambda _: cam.predict(scene, exposure_s=0.01)[0], range(3)))
+    code = (
+        "import pickle, sys; cam, scene = pickle.load(sys.stdin.buffer); "
+        "sys.stdout.buffer.write(pickle.dumps(cam.predict(scene, exposure_s=0.01)[0]))"
+    )
+    other = subprocess.run(
+        [sys.executable, "-c", code], input=pickle.dumps((cam, scene)), capture_output=True, check=True
+    )
+
+    for mean in (*found, pickle.loads(other.stdout)):
+        np.testing.assert_array_equal(mean, expected)
+
+
+@pytest.mark.parametrize("padding", ["reflect", "zero"])
+def test_maps_do_not_depend_on_threads(padding):
+    scene = fs.Scene.from_rgbd(*disc_before_wall((200, 96)), pitch_um=400.0, **LIGHT)
+    optics = fs.Optics(focal_length_mm=8.0, f_number=2.0, padding=padding)
+
+    np.testing.assert_array_equal(optics.power_map(scene, n_threads=1).data, optics.power_map(scene, n_threads=3).data)
+
+
+def test_dual_pixels_share_electrons():
+    """The halves of each pair of photodiodes collect what the full pupil does, up to their displacement."""
+    scene = fs.Scene.from_rgbd(*disc_before_wall(), **LIGHT)
+    left, right, full = (
+        camera(pupil_part=part).capture(scene, exposure_s=0.01, seed=0).expected_e for part in ("left", "right", "full")
+    )
+
+    assert left.sum() + right.sum() == pytest.approx(full.sum(), rel=2e-3)
+    assert np.abs(left - right).max() > 0.05 * full.mean()
+
+
+def test_sweep_varies_focus_and_layers(settings):
+    values = {"optics.focus_distance_m": [0.5, 2.0], "scene.depth_layers": [1, 100]}
+
+    found = fs.explore.sweep(settings, values, metrics=["snr"], workers=0)["snr_median"]
+
+    assert len(np.unique(found)) == 4
+
+
+def test_datasets_refuse_depth(settings):
+    with pytest.raises(
+        (FileError, ParameterError), match="must be 'picture' for a dataset, which supplies the pictures"
+    ):
+        fs.explore.Dataset([np.ones((48, 64))], settings)
+
+
+def test_panoramas_refuse_depth():
+    panorama = fs.Scene.from_panorama(np.ones((16, 32)), luminance_cd_m2=100.0)
+    with pytest.raises(ParameterError, match="'depth_m' must not be given for a panorama"):
+        replace(panorama, depth_m=np.ones((16, 32)))
 
 
 def test_crops_of_gaze_paths_keep_depth():

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import foveasim as fs
 from foveasim.cli import app
 from foveasim.sensor.effects import RowNoise
-from foveasim.twin.frames.chain import Chain
+from foveasim.twin.fitting.chain import Chain
 from foveasim.twin.frames.statistics import StackStatistics, sum_frames
 
 N_Y, N_X = 48, 64

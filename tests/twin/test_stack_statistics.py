@@ -11,8 +11,9 @@ from scipy.stats import binom, chi2, ncx2
 import foveasim as fs
 from foveasim._core.threads import default_threads
 from foveasim.sensor.adc import ADC
-from foveasim.twin.frames import statistics, telegraph
-from foveasim.twin.frames.levels import block_means
+from foveasim.twin.fitting import telegraph
+from foveasim.twin.fitting.levels import block_means
+from foveasim.twin.frames import statistics
 from foveasim.twin.frames.statistics import LinearStatistics, StackStatistics, sum_frames, weighted
 
 

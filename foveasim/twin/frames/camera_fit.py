@@ -18,7 +18,7 @@ from foveasim._io.npz import read_archive, write_archive
 from foveasim.errors import FoveasimError, FoveasimWarning, ParameterError, warn
 from foveasim.metrics.emva import MAX_UNDERFLOW_FRACTION
 from foveasim.sensor.adc import ADC, BITS, LOG_STRENGTH, Companding
-from foveasim.twin.frames.fitting import fit_statistics
+from foveasim.twin.fitting.fitting import fit_statistics
 from foveasim.twin.frames.result import Twin, twin_of
 from foveasim.twin.frames.stacks import Stack, read_stacks
 from foveasim.twin.frames.statistics import StackStatistics, sum_frames

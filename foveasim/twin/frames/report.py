@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.validation import unit_of
-from foveasim.twin.frames.intervals import Estimate
+from foveasim.twin.fitting.intervals import Estimate
 from foveasim.view.web._report_page import (
     FAINT,
     INK,

@@ -22,13 +22,13 @@ from foveasim.layout.generators.grid import grid
 from foveasim.layout.readout import readout_by
 from foveasim.sensor import Sensor
 from foveasim.sensor.adc import ADC
+from foveasim.twin.fitting.intervals import Estimate, Uncertain
 from foveasim.twin.frame_sensors import sensor_of
-from foveasim.twin.frames.intervals import Estimate, Uncertain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from foveasim.twin.frames.fitting import Fitted
+    from foveasim.twin.fitting.fitting import Fitted
 
 __all__ = ["Twin", "read_twin"]
 

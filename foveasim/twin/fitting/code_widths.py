@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from foveasim._core.validation import Floats, Ints
-from foveasim.twin.frames.intervals import Estimate, Uncertain, of_mean
+from foveasim.twin.fitting.intervals import Estimate, Uncertain, of_mean
 
 __all__ = ["fit_code_widths"]
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from foveasim._core.validation import Floats
-from foveasim.twin.frames.intervals import HALF_WIDTH
+from foveasim.twin.fitting.intervals import HALF_WIDTH
 
 __all__ = ["DarkSpread", "fit_dark_spread"]
 

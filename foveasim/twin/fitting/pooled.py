@@ -18,8 +18,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from foveasim._core.validation import Bools, Floats
-from foveasim.twin.frames.chain import Chain, Moments
-from foveasim.twin.frames.levels import Levels
+from foveasim.twin.fitting.chain import Chain, Moments
+from foveasim.twin.fitting.levels import Levels
 
 __all__ = ["Exposures", "PooledFit", "fit_levels"]
 

@@ -1,0 +1,1 @@
+"""Fit of the chain of a sensor to the statistics of stacks."""
