@@ -37,6 +37,7 @@ from gradients import bench_gradients
 from kernels import bench_first_capture, bench_kernels
 from learning import bench_learning, bench_stored
 from looking import bench_looking
+from panorama import bench_panorama
 from report import Report, best_s
 from rich.console import Console
 from small import bench_small
@@ -450,6 +451,7 @@ def benchmarks(*, is_quick: bool) -> list[tuple[Callable[..., object], tuple[obj
         (bench_angular, (shape, side)),
         (bench_field_modes, (side,)),
         (bench_depth, (side,)),
+        (bench_panorama, (side // 2,)),
         (bench_kernels, (side,)),
         (bench_sensor, (n_side,)),
         (bench_small, ()),

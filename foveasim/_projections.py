@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from foveasim._core.validation import Floats
+from foveasim._core.validation import Floats, finite_array
+from foveasim.errors import ParameterError
 
 #: Projections of fisheye lenses.
 FisheyeProjection = Literal["equidistant", "equisolid", "stereographic", "orthographic"]
@@ -22,6 +23,8 @@ FisheyeProjection = Literal["equidistant", "equisolid", "stereographic", "orthog
 ImageProjection = Literal["rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"]
 #: Points within this normalised radius are scaled linearly, which avoids a division by 0.
 MIN_RADIUS = 1e-12
+#: Limits of directions of a camera.
+MAX_AZIMUTH_DEG, MAX_ELEVATION_DEG = 360.0, 90.0
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,24 @@ def points_at(directions: Floats, across: Floats, height: Floats, slope: float) 
     central = np.where(directions[:, 2] > 0.0, slope, np.nan)
     scale = np.where(is_central, central, height / np.where(is_central, 1.0, across))
     return np.asarray(directions[:, :2] * scale[:, np.newaxis])
+
+
+def check_direction(name: str, value: Any) -> tuple[float, float]:
+    """Return an azimuth and an elevation in degrees after validation."""
+    found = finite_array(name, value)
+    if found.shape != (2,) or abs(found[0]) > MAX_AZIMUTH_DEG or abs(found[1]) > MAX_ELEVATION_DEG:
+        raise ParameterError(
+            name, "must be two numbers: the azimuth, within ±360, and the elevation, within ±90", value, "degrees"
+        )
+    return float(found[0]), float(found[1])
+
+
+def turned(azimuth_rad: float, elevation_rad: float) -> Floats:
+    """Return the rotation (3, 3) of a camera to the right, then upwards."""
+    c, s = math.cos(azimuth_rad), math.sin(azimuth_rad)
+    right = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    c, s = math.cos(elevation_rad), math.sin(elevation_rad)
+    return right @ np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
 
 
 #: Projections by name.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.calls import publish
+from foveasim._core.calls import OwnCheck, publish
 from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._core.provenance import copy_plain_data, to_plain_data
@@ -23,6 +24,7 @@ from foveasim._io.atomic import atomic_directory
 from foveasim._io.npz import open_archive, write_archive
 from foveasim._io.zarr_stores import ZARR, Variable, free_name, open_store, store_format, write_variables
 from foveasim.columns import COLUMNS, STORED, column_info, compute_column, find_column
+from foveasim.distortion import LENSES, BrownConrady, Fisheye
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout.model import Layout
@@ -44,7 +46,9 @@ from foveasim.reconstruct import (
     to_cortical,
 )
 from foveasim.reconstruct.picture import PIXELS, Gaps
+from foveasim.reconstruct.unwrap import FIELD, ViewProjection, unwrap
 from foveasim.sensor import Sensor, signal_to_noise
+from foveasim.units import m_from_mm, um_from_m
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -250,6 +254,10 @@ class Capture:
         gaps: Gaps = "fill",
         colour: Literal["corrected", "raw"] | None = None,
         sensor: Sensor | None = None,
+        projection: ViewProjection | None = None,
+        field_of_view_deg: Annotated[float | None, FIELD] = None,
+        towards_deg: OwnCheck[tuple[float, float] | None] = None,
+        lens: OwnCheck[Any] = None,
         **options: Any,
     ) -> Picture:
         """
@@ -283,6 +291,13 @@ class Capture:
         sensor : Sensor, optional
             By default that of the capture. Required for captures that were read from a file, if the sensor has effects that
             are not registered.
+        projection : str, optional
+            ``"equirectangular"``, ``"rectilinear"``, or another projection of :func:`foveasim.reconstruct.unwrap`, to which
+            the picture is mapped through the lens model: panoramas and views of wide fields.
+        field_of_view_deg, towards_deg : optional
+            With ``projection``, the field of the picture and the direction at its centre, by default the optical axis.
+        lens : lens model of foveasim.distortion, optional
+            With ``projection``, by default that of the camera.
         **options
             Options of the method's function: ``mu``, ``blur``, ``tolerance``, ``max_steps`` and ``variance`` for
             ``"least_squares"``, ``n_threads`` for all.
@@ -314,10 +329,51 @@ class Capture:
             hint = possible_names(name, sorted(known))
             raise ParameterError(name, f"must be an option of the method {method!r}", hint=hint)
         self._check_sensor(sensor)
+        if projection is not None and grid is not None:
+            raise ParameterError("grid", "must not be given with 'projection', which has its own pixels", grid)
+        for name, value in (("lens", lens), ("field_of_view_deg", field_of_view_deg), ("towards_deg", towards_deg)):
+            if projection is None and value is not None:
+                raise ParameterError(name, "requires 'projection'", value)
         grid = raster_grid(self.layout, max_pixels) if grid is None else grid
         picture = self._reconstruct(method, grid, of, per, sensor, {"gaps": gaps, **options})
         matrix = self._colour_matrix(colour)
-        return replace(picture, white=self.white_dn, colour_matrix=matrix) if (self.white_dn > 0.0).all() else picture
+        if (self.white_dn > 0.0).all():
+            picture = replace(picture, white=self.white_dn, colour_matrix=matrix)
+        if projection is None:
+            return picture
+        x_um, y_um = self.settings.get("gaze_um", (0.0, 0.0)) if self.settings.get("axis") == "image" else (0.0, 0.0)
+        return unwrap(
+            picture,
+            self._lens_of_settings() if lens is None else lens,
+            projection=projection,
+            field_of_view_deg=field_of_view_deg,
+            towards_deg=(0.0, 0.0) if towards_deg is None else towards_deg,
+            max_pixels=max_pixels,
+            position_um=(float(x_um), float(y_um)),
+        )
+
+    def _lens_of_settings(self) -> Any:
+        """Return the lens model of the camera, or one of its ideal image."""
+        data, optics = self.settings.get("distortion"), self.settings.get("optics") or {}
+        if isinstance(data, Mapping):
+            for model in LENSES.values():
+                if isinstance(model, type) and model.__name__ == data.get("kind"):
+                    return model(**{name: value for name, value in data.items() if name != "kind"})
+        elif "focal_length_mm" in optics:
+            light = self.settings.get("light") or {}
+            focus_m = optics.get("focus_distance_m") or light.get("distance_m") or math.inf
+            focal_m = float(m_from_mm(optics["focal_length_mm"]))
+            x0_um, y0_um, x1_um, y1_um = self.layout.bounds_um
+            ideal: dict[str, Any] = {"focal_um": float(um_from_m(focal_m / (1.0 - focal_m / focus_m)))}
+            if light.get("fit") is not None:  # framed scenes are centred on the layout
+                ideal["centre_um"] = (0.5 * (x0_um + x1_um), 0.5 * (y0_um + y1_um))
+            projection = optics.get("projection", "auto")
+            return (
+                BrownConrady(**ideal)
+                if projection in ("auto", "rectilinear")
+                else Fisheye(projection=projection, **ideal)
+            )
+        raise ParameterError("lens", "must be given: the capture does not contain its lens model")
 
     @property
     def colour_correction(self) -> ColourCorrection | None:

@@ -99,7 +99,7 @@ WRONG = {
     ),
     "kind of a section": (
         lambda: shot_with("kind: flat", "kind: flatt"),
-        "shot.yaml:2:3: scene.kind: must be one of 'picture', 'flat', ",
+        "shot.yaml:2:3: scene.kind: must be one of 'picture', 'panorama', ",
     ),
     "choice": (
         lambda: shot_with("f_number: 4.0", "f_number: 4.0, padding: reflekt"),

@@ -20,13 +20,13 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.show import load, view_method
 from foveasim._core.threads import cached_property, thread_count
 from foveasim._core.validation import Floats, check_per_site, check_point, finite_array
-from foveasim._projections import ImageProjection
+from foveasim._projections import ImageProjection, check_direction
 from foveasim.camera._clock import Clock
 from foveasim.camera._colour import colour_correction
 from foveasim.camera._exposure import ExposureTime
 from foveasim.camera._footprints import FootprintCache, find_incidence, placed
 from foveasim.camera._frames import Frame, ImageCache, Position, check_frames
-from foveasim.camera._framing import axis_of, common_bounds_um, fit_panorama, fit_scene
+from foveasim.camera._framing import Turn, axis_of, common_bounds_um, fit_panorama, fit_scene, turned_panorama
 from foveasim.camera._rates import expected_rates, footprints_at
 from foveasim.camera._steps import SensorFrame, capture_for_time, check_exposure, seconds_of, white_dn
 from foveasim.camera._video import rates_of_frames, video
@@ -44,10 +44,11 @@ from foveasim.optics import Optics
 from foveasim.reconstruct import Picture, reference
 from foveasim.reconstruct.rasters import sum_of_images
 from foveasim.scene import Scene
+from foveasim.scene._panorama import Panorama
 from foveasim.sensor import Footprints, NoiseBudget, Sensor, noise_budget
 from foveasim.sensor.limits import EXPOSURE
 from foveasim.sensor.model.auto_exposure import AUTO_PERCENTILE, AUTO_TARGET, PERCENTILE, TARGET
-from foveasim.units import um_from_nm, w_from_w_m2_um2
+from foveasim.units import um_from_m, um_from_nm, w_from_w_m2_um2
 
 if TYPE_CHECKING:
     from foveasim.twin import PictureComparison
@@ -80,6 +81,9 @@ class Camera:
     gaze_um : (x, y), µm
         Gaze: the point of the image at which the centre of the sensor is. Framing refers to the gaze (0, 0), so that the scale
         of an image does not depend on the gaze.
+    gaze_deg : (azimuth, elevation), degrees
+        Direction in a panorama towards which the camera turns from the orientation of the scene: to the right, then upwards,
+        without roll. The image is computed for each direction.
     axis : {"image", "sensor"}
         What the optical axis is fixed to when the gaze moves. ``"image"``: the sensor moves behind a fixed lens; relative
         illumination, aberrations and distortion stay with the image, which is computed once for all gazes of a video.
@@ -129,6 +133,7 @@ class Camera:
         distortion: Lens | None = None,
         order: Literal[1, 2] | None = None,
         gaze_um: tuple[float, float] = (0.0, 0.0),
+        gaze_deg: OwnCheck[tuple[float, float]] = (0.0, 0.0),
         axis: GazeAxis = "image",
         n_threads: int | None = None,
     ) -> None:
@@ -140,6 +145,7 @@ class Camera:
         self._order: Literal[1, 2] | None = None if order is None else 2 if order == 2 else 1
         self._layout = sensor.layout
         self._gaze_um = check_point("gaze_um", gaze_um)
+        self._gaze_deg = check_direction("gaze_deg", gaze_deg)
         self._axis: GazeAxis = axis
         self._n_threads = thread_count(n_threads)
         #: By grid, order, position, whether the overlaps are stored, footprints, and projection.
@@ -148,7 +154,7 @@ class Camera:
         self._bounds_um: dict[ImageProjection, tuple[float, float, float, float]] = {}
         self._lenses: dict[ImageProjection, ProjectedLens] = {}
         #: The most recent scene with ``fit``, the gaze of a camera that turns, and the framed scene.
-        self._framed: tuple[Scene, Position, Scene] | None = None
+        self._framed: tuple[Scene, Turn, Scene] | None = None
         #: Causes of warnings that are not repeated.
         self._warned: set[str] = set()
 
@@ -192,6 +198,11 @@ class Camera:
         return self._gaze_um
 
     @property
+    def gaze_deg(self) -> tuple[float, float]:
+        """Azimuth and elevation towards which the camera turns in a panorama, degrees."""
+        return self._gaze_deg
+
+    @property
     def axis(self) -> GazeAxis:
         """Reference of the optical axis when the gaze moves: ``"image"`` or ``"sensor"``."""
         return self._axis
@@ -217,7 +228,7 @@ class Camera:
 
     def oversample(self, light: Scene | PowerMap) -> int:
         """Return the number of map cells along a source pixel; 1 for power maps."""
-        light = self._with_pitch(light)
+        light = self.geometry_of(light)
         if isinstance(light, PowerMap):
             return 1
         n = self._optics.oversample
@@ -225,7 +236,7 @@ class Camera:
 
     def order(self, light: Scene | PowerMap) -> Literal[1, 2]:
         """Return the order of integration for a scene or power map."""
-        light = self._with_pitch(light)
+        light = self.geometry_of(light)
         if self._order is not None:
             return self._order
         if isinstance(light, PowerMap):
@@ -291,21 +302,21 @@ class Camera:
             )
         if scene.pitch_um is not None:
             return scene
-        return self._frame([self, *others], scene, (0.0, 0.0))
+        return self._frame([self, *others], scene, Turn())
 
-    def _frame(self, cameras: Sequence[Camera], scene: Scene, gaze_um: Position) -> Scene:
-        """Return a scene with its pitch; ``gaze_um`` turns the camera in a panorama."""
+    def _frame(self, cameras: Sequence[Camera], scene: Scene, turn: Turn | None) -> Scene:
+        """Return a scene with its pitch; cells of a panorama are 0 without a turn."""
         framed = self._framed
-        if len(cameras) == 1 and framed is not None and framed[0] is scene and framed[1] == gaze_um:
+        if len(cameras) == 1 and framed is not None and framed[0] is scene and turn in (framed[1], None):
             return framed[2]
         projection = self.projection(scene)
         bounds_um = common_bounds_um(cameras, str(scene.fit), projection)
         if scene.panorama is None:
             found = fit_scene(scene, self._optics, self._distortion, bounds_um)
         else:
-            found = fit_panorama(scene, self._optics, self._distortion, bounds_um, projection, gaze_um, self._n_threads)
-        if len(cameras) == 1:
-            self._framed = scene, gaze_um, found
+            found = fit_panorama(scene, self._optics, self._distortion, bounds_um, projection, turn, self._n_threads)
+        if len(cameras) == 1 and turn is not None:
+            self._framed = scene, turn, found
         return found
 
     @property
@@ -374,6 +385,12 @@ class Camera:
         """Return a scene with its pitch, or a power map."""
         return self.fit_scene(light) if isinstance(light, Scene) else light
 
+    def geometry_of(self, light: Scene | PowerMap) -> Scene | PowerMap:
+        """Return a scene with its pitch, of a panorama with pixels of 0, or a power map."""
+        if isinstance(light, Scene) and light.panorama is not None and light.pitch_um is None:
+            return self._frame([self], light, None)
+        return self._with_pitch(light)
+
     @overload
     def light_at_gaze(self, light: Scene, gaze_um: Position | None = None) -> Scene: ...
 
@@ -394,13 +411,26 @@ class Camera:
         -------
         Scene or PowerMap
             For ``axis="sensor"`` a scene whose centre is displaced against the gaze, or a panorama seen in its direction;
-            otherwise only the pitch is set.
+            otherwise only the pitch is set. A panorama is turned by :attr:`gaze_deg`, unless it has a gaze of its own
+            (:func:`foveasim.video.turn_camera`).
 
         Raises
         ------
         ParameterError
-            For a power map and ``axis="sensor"``: its relative illumination cannot follow the gaze.
+            For a power map and ``axis="sensor"``: its relative illumination cannot follow the gaze; for ``gaze_deg`` and a
+            scene that is not a panorama.
         """
+        if isinstance(light, Scene) and light.panorama is not None:
+            moved_um = self._gaze_um if gaze_um is None else check_point("gaze_um", gaze_um)
+            return self._frame([self], light, self._turn(light.panorama, moved_um))
+        if any(self._gaze_deg):
+            raise ParameterError(
+                "gaze_deg",
+                "must be (0, 0) for a plane, a power map, and a panorama that a camera has framed; use 'gaze_um', or turn the "
+                "panorama first: Scene.turned",
+                self._gaze_deg,
+                "degrees",
+            )
         gaze = np.array(self._gaze_um) if gaze_um is None else np.array(check_point("gaze_um", gaze_um))
         if self._axis == "image" or not gaze.any():
             return self._with_pitch(light)
@@ -410,8 +440,6 @@ class Camera:
                 "must be 'image' for a power map: its relative illumination and aberrations are fixed",
                 self._axis,
             )
-        if light.panorama is not None:
-            return self._frame([self], light, (float(gaze[0]), float(gaze[1])))
         scene = self.fit_scene(light)
         if scene.projection != "rectilinear":
             raise ParameterError(
@@ -422,6 +450,27 @@ class Camera:
         per_um = self.sensor_frame(scene).scale * self._optics.magnification(scene.distance_m)
         x_um, y_um = (np.array(scene.centre_um) - gaze / per_um).tolist()
         return scene.with_centre((x_um, y_um))
+
+    def seen_panorama(self, scene: Scene) -> Panorama:
+        """Return the panorama of a scene with the orientation at the gaze of the camera."""
+        assert scene.panorama is not None
+        projection, frame = self.projection(scene), self.sensor_frame(scene)
+        focal_um = self._optics.magnification(scene.distance_m) * float(um_from_m(scene.distance_m))
+        turn = self._turn(scene.panorama, self._gaze_um)
+        return turned_panorama(scene.panorama, self._distortion, projection, np.array(frame.axis_um), focal_um, turn)
+
+    def _turn(self, panorama: Panorama, gaze_um: Position) -> Turn:
+        """Return the turn of a camera in a panorama."""
+        if self._axis == "image" or not any(gaze_um):
+            return Turn(gaze_deg=self._gaze_deg)
+        if any(self._gaze_deg) or panorama.gaze_deg is not None:
+            raise ParameterError(
+                "gaze_um",
+                "must be (0, 0) for axis='sensor' and a camera that turns by 'gaze_deg'; use one of both",
+                gaze_um,
+                "µm",
+            )
+        return Turn(gaze_um=gaze_um)
 
     @property
     def position_um(self) -> Position:
@@ -535,6 +584,7 @@ class Camera:
         optics: Optics | None = None,
         sensor: Sensor | None = None,
         gaze_um: tuple[float, float] | None = None,
+        gaze_deg: OwnCheck[tuple[float, float] | None] = None,
         axis: GazeAxis | None = None,
         n_threads: int | None = None,
     ) -> Camera:
@@ -549,6 +599,7 @@ class Camera:
             distortion=self._distortion,
             order=self._order,
             gaze_um=self._gaze_um if gaze_um is None else gaze_um,
+            gaze_deg=self._gaze_deg if gaze_deg is None else gaze_deg,
             axis=self._axis if axis is None else axis,
             n_threads=self._n_threads if n_threads is None else n_threads,
         )
@@ -558,7 +609,13 @@ class Camera:
                 other._integrators = self._integrators
         return other
 
-    def with_gaze(self, gaze_um: tuple[float, float] | None, axis: GazeAxis | None = None) -> Camera:
+    def with_gaze(
+        self,
+        gaze_um: tuple[float, float] | None = None,
+        axis: GazeAxis | None = None,
+        *,
+        gaze_deg: OwnCheck[tuple[float, float] | None] = None,
+    ) -> Camera:
         """
         Return the camera with another gaze.
 
@@ -567,6 +624,8 @@ class Camera:
         gaze_um : (x, y) or None, µm
             See the class; None for that of this camera.
         axis : {"image", "sensor"}, optional
+            As for the class; by default that of this camera.
+        gaze_deg : (azimuth, elevation), optional, degrees
             As for the class; by default that of this camera.
 
         Returns
@@ -584,9 +643,9 @@ class Camera:
         >>> camera.with_gaze((20.0, -5.0)).gaze_um
         (20.0, -5.0)
         """
-        if gaze_um is None and axis is None:
+        if gaze_um is None and axis is None and gaze_deg is None:
             return self
-        other = self.replace(gaze_um=gaze_um, axis=axis)
+        other = self.replace(gaze_um=gaze_um, axis=axis, gaze_deg=gaze_deg)
         other._warned = self._warned
         return other
 
@@ -629,6 +688,7 @@ class Camera:
         frame: int = 0,
         gaze_um: tuple[float, float] | None = None,
         axis: GazeAxis | None = None,
+        gaze_deg: OwnCheck[tuple[float, float] | None] = None,
         photo_e_per_s: Floats | None = None,
     ) -> Capture:
         """
@@ -647,12 +707,14 @@ class Camera:
             Point of the image at which the centre of the sensor is, instead of the gaze of the camera.
         axis : {"image", "sensor"}, optional
             What the optical axis is fixed to: see the class.
+        gaze_deg : (azimuth, elevation), optional, degrees
+            Direction towards which the camera turns in a panorama, instead of that of the camera.
         photo_e_per_s : (n_site,) float64, optional, e-/s
             Result of :meth:`photoelectrons_per_s` for the same ``light`` and gaze, which is then not computed again; without
             warnings of the exposure.
         """
-        if gaze_um is not None or axis is not None:
-            return self.with_gaze(gaze_um, axis).capture(
+        if gaze_um is not None or axis is not None or gaze_deg is not None:
+            return self.with_gaze(gaze_um, axis, gaze_deg=gaze_deg).capture(
                 light, exposure_s=exposure_s, seed=seed, frame=frame, photo_e_per_s=photo_e_per_s
             )
         streams = Streams(seed, frame)
@@ -849,13 +911,14 @@ class Camera:
         exposure_s: ExposureTime,
         gaze_um: tuple[float, float] | None = None,
         axis: GazeAxis | None = None,
+        gaze_deg: OwnCheck[tuple[float, float] | None] = None,
     ) -> tuple[Floats, Floats]:
         """
         Return mean and variance of every site's code analytically.
 
         Parameters
         ----------
-        light, exposure_s, gaze_um, axis
+        light, exposure_s, gaze_um, axis, gaze_deg
             As for :meth:`capture`.
 
         Returns
@@ -863,7 +926,7 @@ class Camera:
         mean_dn, variance_dn2 : (n_site,) float64, DN and DN²
             Over the temporal noise of this device; its fixed patterns are part of the mean.
         """
-        rate_e_per_s = self.with_gaze(gaze_um, axis).photoelectrons_per_s(light)
+        rate_e_per_s = self.with_gaze(gaze_um, axis, gaze_deg=gaze_deg).photoelectrons_per_s(light)
         exposure_s = seconds_of(self, exposure_s, rate_e_per_s)
         expected_e = self._sensor.expected_electrons(rate_e_per_s, exposure_s)
         return self._sensor.predict(expected_e, exposure_s=exposure_s, n_threads=self._n_threads)

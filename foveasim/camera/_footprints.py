@@ -10,7 +10,7 @@ import numpy as np
 from foveasim._core.caches import BoundedCache
 from foveasim._core.validation import read_only
 from foveasim.camera._steps import SensorFrame
-from foveasim.camera._warnings import warn_of_small_openings
+from foveasim.camera._warnings import warn_of_oblique_rays, warn_of_small_openings
 from foveasim.fields import PackedRings, PowerMap
 from foveasim.incidence import Incidence
 from foveasim.layout.model import Layout, layout_of
@@ -67,6 +67,7 @@ def find_footprints(
         return None
     incidence, axis_um = find_incidence(camera, layout, light, position_um)
     cache = FootprintCache() if cache is None else cache
+    warn_of_oblique_rays(incidence, camera._warned)
     warn_of_small_openings(cache.opening_um(pixel_optics, layout), light)
     return cache.get(pixel_optics, layout, camera.optics, incidence, axis_um)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from foveasim.distortion._projected import directions_of
 from foveasim.errors import ParameterError
 from foveasim.optics import Optics
 from foveasim.scene import Scene
+from foveasim.scene._panorama import Panorama
 from foveasim.units import um_from_m
 
 if TYPE_CHECKING:
@@ -102,20 +104,31 @@ def fit_scene(scene: Scene, optics: Optics, lens: Lens | None, bounds_um: Floats
     return scene.framed(float(scale) * unit_um, frame.axis_um)
 
 
+class Turn(NamedTuple):
+    """
+    Gaze of a camera that turns.
+
+    ``gaze_um`` is a point of the sensor, ``gaze_deg`` azimuth and elevation. At most one of them differs from (0, 0).
+    """
+
+    gaze_um: Position = (0.0, 0.0)
+    gaze_deg: tuple[float, float] = (0.0, 0.0)
+
+
 def fit_panorama(
     scene: Scene,
     optics: Optics,
     lens: Lens | None,
     bounds_um: Floats,
     projection: ImageProjection,
-    gaze_um: Position,
+    turn: Turn | None,
     n_threads: int,
 ) -> Scene:
     """
     Return the image of a panorama in a projection, as a scene of its cells.
 
-    ``bounds_um``: bounds of the field, (4,), in the image; its cells extend a few cells beyond. ``gaze_um``: the point of the
-    sensor towards which the camera turns.
+    ``bounds_um``: bounds of the field, (4,), in the image; its cells extend a few cells beyond. ``turn``: gaze of the camera,
+    or None for the geometry only, with cells that are 0.
     """
     panorama = scene.panorama
     assert panorama is not None
@@ -128,13 +141,24 @@ def fit_panorama(
     if optics.lateral_colour is not None:
         reach = reach / min(float(optics.lateral_colour.at(scene.wavelength_nm).min()), 1.0)
     reach = np.minimum(reach, law.max_height)
-    if gaze_um != (0.0, 0.0):
-        panorama = panorama.towards(_gaze_direction(lens, projection, axis_um, focal_um, gaze_um))
     n_along = panorama.n_cells(scene.basis.shape[1:], 2.0 * float(reach.max()))
     pitch = 2.0 * float(reach.max()) / n_along
     n_x, n_y = (2 * (math.ceil(0.5 * each) + MARGIN_CELLS) for each in 2.0 * reach / pitch - CENTRE_ROUNDING)
-    cells = panorama.cell_means(scene.basis, projection, (n_y, n_x), pitch, n_threads)
+    if turn is None:
+        cells = np.broadcast_to(np.float32(0.0), (scene.basis.shape[0], n_y, n_x))
+    else:
+        seen = turned_panorama(panorama, lens, projection, axis_um, focal_um, turn)
+        cells = seen.cell_means(scene.basis, projection, (n_y, n_x), pitch, n_threads)
     return scene.resampled(cells, pitch * distance_um, frame.axis_um, projection)
+
+
+def turned_panorama(
+    panorama: Panorama, lens: Lens | None, projection: ImageProjection, axis_um: Floats, focal_um: float, turn: Turn
+) -> Panorama:
+    """Return a panorama as a camera sees it at its gaze."""
+    if any(turn.gaze_um):
+        return panorama.towards(_gaze_direction(lens, projection, axis_um, focal_um, turn.gaze_um))
+    return replace(panorama, gaze_deg=turn.gaze_deg) if panorama.gaze_deg is None else panorama
 
 
 def _gaze_direction(

@@ -194,6 +194,7 @@ def capture_settings(camera: Camera, light: Scene | PowerMap, exposure_s: float,
         "colour": None if colour is None else colour.to_settings(),
         **camera.settings,
         "gaze_um": list(camera.gaze_um),
+        **({"gaze_deg": list(camera.gaze_deg)} if any(camera.gaze_deg) else {}),
         "axis": camera.axis,
         "oversample": camera.oversample(light),
         "integration_order": camera.order(light),
@@ -218,7 +219,8 @@ def _light_settings(camera: Camera, light: Scene | PowerMap) -> dict[str, object
             "grid": to_plain_data(light.grid),
             "wavelength_nm": light.wavelength_nm.tolist(),
         }
-    framed, panorama = camera.fit_scene(light), light.panorama
+    framed, panorama = camera.geometry_of(light), light.panorama
+    assert isinstance(framed, Scene)
     # The settings of a plane do not mention the projection.
     directions = {} if framed.projection == "rectilinear" and panorama is None else {"projection": framed.projection}
     if panorama is not None:

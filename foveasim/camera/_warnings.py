@@ -13,6 +13,7 @@ from foveasim.capture import Capture
 from foveasim.distortion import Lens
 from foveasim.errors import CoverageWarning, ExposureWarning, FoveasimWarning, ParameterError, SamplingWarning, warn
 from foveasim.fields import Grid, PointMap, PowerMap
+from foveasim.incidence import Incidence
 from foveasim.integrate import Integrator
 from foveasim.layout.model import Layout
 from foveasim.optics import Optics
@@ -28,6 +29,8 @@ MAX_FOCAL_DIFFERENCE = 0.02
 MAX_SATURATED, MAX_BELOW_PIXELS = 0.2, 0.1
 #: Cameras warn of openings of pixel optics that measure fewer wavelengths in their layer.
 MIN_OPENING_WAVELENGTHS = 2.0
+#: Cameras with pixel optics warn of more oblique chief rays.
+MAX_CHIEF_RAY_DEG = 60.0
 #: Error of photosites above which a limited automatic oversampling causes a warning.
 MAX_AUTO_ERROR = 1e-3
 
@@ -261,6 +264,21 @@ def warn_of_small_openings(opening_um: float, light: Scene | PowerMap) -> None:
             f"the narrowest opening of the pixel optics measures {opening_um / wavelength_um:.2g} wavelengths in its layer, "
             f"fewer than {MIN_OPENING_WAVELENGTHS:g}: geometric rays neglect diffraction; use larger sites, "
             "or a measured 'sensitivity'",
+            FoveasimWarning,
+        )
+
+
+def warn_of_oblique_rays(incidence: Incidence, warned: set[str]) -> None:
+    """Warn, once per camera, of chief rays that are too oblique for models of pixel optics."""
+    if "chief rays" in warned:
+        return
+    warned.add("chief rays")
+    tangent = float(np.hypot(*incidence.chief_ray.T).max(initial=0.0))
+    if tangent > math.tan(math.radians(MAX_CHIEF_RAY_DEG)):
+        warn(
+            f"chief rays reach the sensor at up to {math.degrees(math.atan(tangent)):.0f}° to its normal, beyond "
+            f"{MAX_CHIEF_RAY_DEG:g}°, where the response of pixels is not known; the exit pupils of fisheye lenses are farther "
+            "from the sensor than the thin lens: set Optics(exit_pupil_mm=...), or its 'chief_ray'",
             FoveasimWarning,
         )
 

@@ -318,6 +318,12 @@ def _models(_versions: tuple[int, ...]) -> Models:
             tuple[float, float],
             Field((0.0, 0.0), description="point of the image, in µm, at which the centre of the sensor is"),
         ),
+        "gaze_deg": (
+            tuple[float, float],
+            Field(
+                (0.0, 0.0), description="direction in a panorama, [azimuth, elevation], towards which the camera turns"
+            ),
+        ),
         "gaze_path": (
             _GazeRows | str | None,
             Field(

@@ -354,7 +354,8 @@ def build_shot(
     # Other optics and electronics share the compiled layout.
     camera = _call(
         source, "", camera.replace,
-        {"optics": optics, "sensor": sensor, "gaze_um": settings.gaze_um, "axis": settings.axis},
+        {"optics": optics, "sensor": sensor, "gaze_um": settings.gaze_um, "gaze_deg": settings.gaze_deg,
+         "axis": settings.axis},
     )  # fmt: skip
     if isinstance(scene, Scene):
         framed = _call(source, "scene", camera.light_at_gaze, {"light": scene})

@@ -120,7 +120,7 @@ def _shot_lines(writer: _Writer, shot: Any) -> list[str]:
         else:
             make, first["origin"] = f"fs.Sensor.from_{name}", origin
     capture = {"scene": _Name("scene"), "exposure_s": shot.exposure_s, "seed": shot.seed}
-    for name in ("gaze_um", "axis"):
+    for name in ("gaze_um", "gaze_deg", "axis"):
         if getattr(shot, name) != type(shot).model_fields[name].default:
             camera[name] = getattr(shot, name)
     return [

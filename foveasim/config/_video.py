@@ -20,7 +20,15 @@ from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.layout.rows import Scan
 from foveasim.scene import Scene
-from foveasim.video import FrameSource, GazePath, count_recorded_frames, follow_gaze, write_video
+from foveasim.video import (
+    DirectionPath,
+    FrameSource,
+    GazePath,
+    count_recorded_frames,
+    follow_gaze,
+    read_gaze_path,
+    write_video,
+)
 from foveasim.video.frame_source import list_pictures
 from foveasim.video.writing import DEFAULT_FRAME_S
 
@@ -62,7 +70,7 @@ def run_video(
     stop : int, optional
         Maximum number of frames.
     gaze : path, optional
-        CSV file of a gaze path (:meth:`foveasim.video.GazePath.read`), with times from the first frame, instead of the path of
+        CSV file of a gaze path (:func:`foveasim.video.read_gaze_path`), with times from the first frame, instead of the path of
         the shot (``gaze_path``); without both, each frame has the gaze of the shot.
     n_threads : int, optional
         Number of frames that are computed at a time; one per core by default.
@@ -103,7 +111,7 @@ def run_video(
         raise ParameterError(
             "frame_s", "or 'times_s' must be given for a rolling shutter: pictures in a directory have no times"
         )
-    path = shot.gaze_path if gaze is None else GazePath.read(gaze)
+    path = shot.gaze_path if gaze is None else read_gaze_path(gaze)
     is_store = Path(out).suffix.lower() == ".zarr"
     n_before = count_recorded_frames(out) if is_store else 0
     scenes = source.from_frame(n_before)
@@ -140,7 +148,7 @@ def _plan(
     line_s: float,
     scan: Scan | None,
     stop: int | None,
-    path: GazePath | None,
+    path: GazePath | DirectionPath | None,
 ) -> dict[str, Any]:
     """Return everything that codes depend on; for frames, names and sizes of their files."""
     camera, layout = shot.camera, shot.camera.sensor.layout
@@ -161,6 +169,11 @@ def _plan(
         "shutter": {"frame_s": source.frame_s, "line_s": line_s, "scan": scan} if line_s else None,
         "times_s": None if source.frame_s is not None else to_plain_data(source.times_s),
         "stop": stop,
-        "gaze": {"gaze_um": camera.gaze_um, "axis": camera.axis, "path": None if path is None else to_plain_data(path)},
+        "gaze": {
+            "gaze_um": camera.gaze_um,
+            "gaze_deg": camera.gaze_deg,
+            "axis": camera.axis,
+            "path": None if path is None else to_plain_data(path),
+        },
         "versions": versions(),
     }

@@ -40,7 +40,7 @@ MAX_DEPTH = 6
 #: Sections of the settings of a shot that do not change the photoelectron rates, and others that do not change the optical
 #: images; the responsivity of the sensor changes both.
 AFTER_LIGHT = ("sensor", "exposure_s", "seed", "requirements", "gaze_path", "times_s")
-AFTER_IMAGE = ("layout", "distortion", "integration_order", "gaze_um", "axis")
+AFTER_IMAGE = ("layout", "distortion", "integration_order", "gaze_um", "gaze_deg", "axis")
 #: Longest stored message, characters.
 MAX_MESSAGE_LENGTH = 500
 
@@ -308,11 +308,23 @@ def _image_settings(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
     """Return all that determines the optical images of the filters in use, as plain data."""
     scene = shot.scene
     # With 'fit' the pitch depends on layout and distortion.
-    pitch_um = shot.camera.fit_scene(scene).pitch_um if isinstance(scene, Scene) else None
+    pitch_um: Any = None
+    if isinstance(scene, Scene):
+        framed = shot.camera.geometry_of(scene)
+        assert isinstance(framed, Scene)
+        pitch_um = framed.pitch_um
+        if scene.panorama is not None:  # its image depends on the lens model and the bounds of the layout
+            pitch_um = [pitch_um, framed.projection, framed.basis.shape, to_plain_data(shot.camera.distortion)]
     gaze_um = shot.camera.gaze_um if shot.camera.axis == "sensor" else None
     # Images that are computed together share sums, whose rounding depends on their number.
     used = shot.camera.sensor.filters_used.tolist()
-    return [_without(settings, (*AFTER_LIGHT, *AFTER_IMAGE)), pitch_um, gaze_um, _responsivity_digest(shot), used]
+    return [
+        _without(settings, (*AFTER_LIGHT, *AFTER_IMAGE)),
+        pitch_um,
+        [gaze_um, shot.camera.gaze_deg],
+        _responsivity_digest(shot),
+        used,
+    ]
 
 
 def _without(settings: Mapping[str, Any], sections: Sequence[str]) -> dict[str, Any]:

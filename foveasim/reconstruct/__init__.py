@@ -11,6 +11,7 @@ from foveasim.reconstruct.interpolation import linear, natural
 from foveasim.reconstruct.least_squares import least_squares
 from foveasim.reconstruct.picture import Picture, raster_grid
 from foveasim.reconstruct.rasters import blur_kernel, reference
+from foveasim.reconstruct.unwrap import unwrap
 
 __all__ = [
     "ColourCorrection",
@@ -31,6 +32,7 @@ __all__ = [
     "raster_grid",
     "reference",
     "to_cortical",
+    "unwrap",
 ]
 
 publish(__name__)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from foveasim._core.calls import POSITIVE, Limits, OwnCheck, check_declared
 from foveasim._core.threads import parallel_map
 from foveasim._core.validation import Floats, Images, read_only
-from foveasim._projections import LAWS, ImageProjection
+from foveasim._projections import LAWS, ImageProjection, check_direction, turned
 from foveasim.errors import ParameterError
 
 #: Arrangement of the directions of a picture.
@@ -65,8 +65,8 @@ class Panorama:
         Calibration of a fisheye photograph.
     pixel_um : float, optional, µm
         Its pixel size.
-    gaze_deg : (azimuth, elevation), degrees
-        Direction towards which the camera turns from this orientation.
+    gaze_deg : (azimuth, elevation), optional, degrees
+        Direction towards which the camera turns from this orientation, instead of its gaze.
     """
 
     mapping: Mapping = "equirectangular"
@@ -76,10 +76,12 @@ class Panorama:
     cells: Annotated[int | Literal["auto"], CELLS] = "auto"
     lens: OwnCheck[Any] = None
     pixel_um: Annotated[float | None, POSITIVE] = None
-    gaze_deg: tuple[float, float] = (0.0, 0.0)
+    gaze_deg: OwnCheck[tuple[float, float] | None] = None
 
     def __post_init__(self) -> None:
         check_declared(self)
+        if self.gaze_deg is not None:
+            object.__setattr__(self, "gaze_deg", check_direction("gaze_deg", self.gaze_deg))
         is_fisheye = self.mapping == "fisheye"
         if is_fisheye and not hasattr(self.lens, "project"):
             raise ParameterError(
@@ -115,11 +117,11 @@ class Panorama:
     def rotation(self) -> Floats:
         """Rotation (3, 3) from directions of the camera to those of the panorama."""
         yaw, pitch, roll, azimuth, elevation = (
-            math.radians(each) for each in (self.yaw_deg, self.pitch_deg, self.roll_deg, *self.gaze_deg)
+            math.radians(each) for each in (self.yaw_deg, self.pitch_deg, self.roll_deg, *(self.gaze_deg or (0.0, 0.0)))
         )
         c, s = math.cos(roll), math.sin(roll)
         rolled = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        return _turned(yaw, pitch) @ rolled @ _turned(azimuth, elevation)
+        return turned(yaw, pitch) @ rolled @ turned(azimuth, elevation)
 
     def n_cells(self, shape: tuple[int, ...], extent: float) -> int:
         """Return the cells along the longer side of an image, of ``extent`` focal lengths."""
@@ -190,6 +192,12 @@ class Panorama:
 
         parallel_map(fill, range(0, n_y, n_rows), n_threads)
 
+    def pixels_at(self, directions: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:
+        """Return rows and columns of directions (n, 3), from the lower left pixel."""
+        n_points = directions.shape[0]
+        u0, u1, v0, v1 = self._boxes(directions, np.full(n_points, 1e-9), (n_points, 1), shape)
+        return 0.5 * (v0 + v1) - 0.5, 0.5 * (u0 + u1) - 0.5
+
     def _row_weights(self, n_y: int) -> Floats:
         """Return the relative solid angle of the pixels of each row."""
         if self.mapping != "equirectangular":
@@ -217,14 +225,6 @@ class Panorama:
             *(np.clip(u + side * half_u, 0.0, n_x) for side in (-1, 1)),
             *(np.clip(v + side * half_v, 0.0, n_y) for side in (-1, 1)),
         )
-
-
-def _turned(azimuth_rad: float, elevation_rad: float) -> Floats:
-    """Return the rotation (3, 3) of a camera to the right and upwards."""
-    c, s = math.cos(azimuth_rad), math.sin(azimuth_rad)
-    right = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-    c, s = math.cos(elevation_rad), math.sin(elevation_rad)
-    return right @ np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
 
 
 def _half_widths(at: Floats) -> Floats:

@@ -349,7 +349,12 @@ class Scene:
         return self._with(basis=basis, projection=projection, panorama=None).framed(pitch_um, axis_um)
 
     def turned(
-        self, *, yaw_deg: float | None = None, pitch_deg: float | None = None, roll_deg: float | None = None
+        self,
+        *,
+        yaw_deg: float | None = None,
+        pitch_deg: float | None = None,
+        roll_deg: float | None = None,
+        gaze_deg: OwnCheck[tuple[float, float] | None] = None,
     ) -> Scene:
         """
         Return a panorama with another orientation of the camera.
@@ -358,6 +363,8 @@ class Scene:
         ----------
         yaw_deg, pitch_deg, roll_deg : float, optional, degrees
             As for :meth:`from_panorama`; by default those of this scene.
+        gaze_deg : (azimuth, elevation), optional, degrees
+            Direction towards which the camera turns from this orientation, instead of :attr:`foveasim.Camera.gaze_deg`.
 
         Returns
         -------
@@ -379,7 +386,7 @@ class Scene:
         """
         if self.panorama is None:
             raise ParameterError("scene", "must be a panorama, which Scene.from_panorama creates, got a plane")
-        angles = {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg}
+        angles = {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg, "gaze_deg": gaze_deg}
         given: dict[str, Any] = {name: value for name, value in angles.items() if value is not None}
         return self._with(panorama=replace(self.panorama, **given))
 

@@ -15,11 +15,21 @@ from __future__ import annotations
 
 from foveasim._core.calls import publish
 from foveasim.video.frame_source import FrameSource
-from foveasim.video.gaze import GazePath, follow_gaze, pan_camera, saccades, shift_sensor
+from foveasim.video.gaze import (
+    DirectionPath,
+    GazePath,
+    follow_gaze,
+    pan_camera,
+    read_gaze_path,
+    saccades,
+    shift_sensor,
+    turn_camera,
+)
 from foveasim.video.recording import Recording, count_recorded_frames, partial_path, read_recording
 from foveasim.video.writing import write_video
 
 __all__ = [
+    "DirectionPath",
     "FrameSource",
     "GazePath",
     "Recording",
@@ -27,9 +37,11 @@ __all__ = [
     "follow_gaze",
     "pan_camera",
     "partial_path",
+    "read_gaze_path",
     "read_recording",
     "saccades",
     "shift_sensor",
+    "turn_camera",
     "write_video",
 ]
 

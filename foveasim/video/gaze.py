@@ -17,8 +17,9 @@ from foveasim._core.short_repr import short_repr
 from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
 from foveasim._io.atomic import atomic_write
 from foveasim._io.text_files import read_columns
+from foveasim._projections import check_direction
 from foveasim.camera import Camera
-from foveasim.camera._frames import PathPosition, TimedFrames, carried_times, path_digests, path_positions
+from foveasim.camera._frames import Frame, PathPosition, TimedFrames, carried_times, path_digests, path_positions
 from foveasim.errors import FileError, ParameterError, format_value
 from foveasim.fields import PowerMap
 from foveasim.modes.frame_times import FrameTimes
@@ -26,7 +27,16 @@ from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.sensor.limits import DURATION
 
-__all__ = ["GazePath", "follow_gaze", "pan_camera", "saccades", "shift_sensor"]
+__all__ = [
+    "DirectionPath",
+    "GazePath",
+    "follow_gaze",
+    "pan_camera",
+    "read_gaze_path",
+    "saccades",
+    "shift_sensor",
+    "turn_camera",
+]
 
 #: Shape of the gamma distribution of fixation durations: the standard deviation is half the mean.
 FIXATION_SHAPE = 4.0
@@ -35,7 +45,10 @@ MIN_FIXATION = 0.2
 #: Upper limit of points; longer paths indicate wrong units.
 MAX_POINTS = 10**8
 #: Columns of a file, and its size limit.
+MAX_HEADER_BYTES = 65536
 COLUMNS, MAX_FILE_BYTES = ("t_s", "x_um", "y_um"), 1 << 28
+#: Columns of a file of directions.
+DIRECTION_COLUMNS = ("t_s", "azimuth_deg", "elevation_deg")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +85,9 @@ class GazePath:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        t_s, xy_um = finite_array("t_s", self.t_s, ndim=1), finite_array("xy_um", self.xy_um, ndim=2)
-        if t_s.size == 0 or np.any(np.diff(t_s) <= 0.0):
-            raise ParameterError("t_s", "must be one or more times in strictly ascending order", t_s, "s")
-        if xy_um.shape != (t_s.size, 2):
-            raise ParameterError(
-                "xy_um", f"must have the shape ({t_s.size}, 2), one position per time, got {xy_um.shape}"
-            )
-        object.__setattr__(self, "t_s", read_only(t_s.copy()))
-        object.__setattr__(self, "xy_um", read_only(xy_um.copy()))
+        t_s, xy_um = _checked_points(self.t_s, "xy_um", self.xy_um)
+        object.__setattr__(self, "t_s", t_s)
+        object.__setattr__(self, "xy_um", xy_um)
 
     @classmethod
     def read(cls, path: str | Path) -> GazePath:
@@ -97,18 +104,7 @@ class GazePath:
         FileError
             When the file cannot be read, or is not such a table.
         """
-        path = Path(path)
-        lines = read_columns(path, "a table of gazes", COLUMNS, MAX_FILE_BYTES)
-        rows = []
-        for number, cells in lines:
-            try:
-                rows.append([float(cell) for cell in cells])
-            except ValueError:
-                raise FileError(path, f"must have numbers in line {number}, got {', '.join(cells)[:60]}") from None
-        problem = _problem_of_rows(rows, [f"line {number}" for number, _ in lines])
-        if problem is not None:
-            raise FileError(path, problem)
-        return cls._of(rows)
+        return cls._of(_read_rows(Path(path), COLUMNS))
 
     @classmethod
     def from_rows(cls, rows: OwnCheck[Sequence[Sequence[float]] | Floats]) -> GazePath:
@@ -165,18 +161,137 @@ class GazePath:
 
         Before the first and after the last point the position is constant.
         """
-        times_s = finite_array("t_s", t_s)
-        return np.stack([np.interp(times_s, self.t_s, self.xy_um[:, axis]) for axis in (0, 1)], axis=-1)
+        return _interpolated(t_s, self.t_s, self.xy_um)
 
 
-def _problem_of_rows(rows: Sequence[Sequence[float]] | Floats, names: Sequence[str]) -> str | None:
+@dataclass(frozen=True, eq=False)
+class DirectionPath:
+    """
+    Directions of a camera that turns in a panorama, as a function of time.
+
+    Parameters
+    ----------
+    t_s : (n,) float64, s
+        Times in strictly ascending order.
+    direction_deg : (n, 2) float64, degrees
+        Azimuth, within ±360, and elevation, within ±90: :attr:`foveasim.Camera.gaze_deg`. Both are interpolated linearly.
+
+    Raises
+    ------
+    ParameterError
+        When times are not strictly ascending, there is not one direction per time, or an angle is out of range.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> path = fs.video.DirectionPath(
+    ...     np.array([0.0, 1.0]), np.array([[0.0, 0.0], [90.0, 10.0]])
+    ... )
+    >>> path.at([0.5]).tolist()
+    [[45.0, 5.0]]
+    """
+
+    t_s: Floats
+    direction_deg: Floats
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        t_s, direction_deg = _checked_points(self.t_s, "direction_deg", self.direction_deg)
+        for each_deg in direction_deg.tolist():
+            check_direction("direction_deg", each_deg)
+        object.__setattr__(self, "t_s", t_s)
+        object.__setattr__(self, "direction_deg", direction_deg)
+
+    def at(self, t_s: ArrayLike) -> Floats:
+        """
+        Return the directions at given times, (..., 2) degrees, by linear interpolation.
+
+        Before the first and after the last point the direction is constant.
+        """
+        return _interpolated(t_s, self.t_s, self.direction_deg)
+
+
+def read_gaze_path(path: str | Path) -> GazePath | DirectionPath:
+    """
+    Read a path of positions or of directions from a CSV file.
+
+    Parameters
+    ----------
+    path : path
+        UTF-8 text whose first line names the columns: ``t_s``, ``x_um`` and ``y_um``, or ``t_s``, ``azimuth_deg`` and
+        ``elevation_deg``. Others are ignored.
+
+    Returns
+    -------
+    GazePath or DirectionPath
+
+    Raises
+    ------
+    FileError
+        When the file cannot be read, or is not such a table.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            is_direction = set(DIRECTION_COLUMNS) <= {
+                name.strip() for name in file.readline(MAX_HEADER_BYTES).decode("utf-8-sig", "replace").split(",")
+            }
+    except OSError:  # reported by the reader
+        is_direction = False
+    if not is_direction:
+        return GazePath.read(path)
+    values = np.array(_read_rows(path, DIRECTION_COLUMNS), dtype=float)
+    try:
+        return DirectionPath(values[:, 0], values[:, 1:])
+    except ParameterError as error:
+        raise FileError(path, error.detail) from None
+
+
+def _checked_points(t_s: ArrayLike, name: str, values: ArrayLike) -> tuple[Floats, Floats]:
+    """Return times (n,) and points (n, 2), read-only."""
+    times_s, points = finite_array("t_s", t_s, ndim=1), finite_array(name, values, ndim=2)
+    if times_s.size == 0 or np.any(np.diff(times_s) <= 0.0):
+        raise ParameterError("t_s", "must be one or more times in strictly ascending order", times_s, "s")
+    if points.shape != (times_s.size, 2):
+        raise ParameterError(
+            name, f"must have the shape ({times_s.size}, 2), one position per time, got {points.shape}"
+        )
+    return read_only(times_s.copy()), read_only(points.copy())
+
+
+def _interpolated(at_s: ArrayLike, t_s: Floats, points: Floats) -> Floats:
+    times_s = finite_array("t_s", at_s)
+    return np.stack([np.interp(times_s, t_s, points[:, axis]) for axis in (0, 1)], axis=-1)
+
+
+def _read_rows(path: Path, columns: tuple[str, ...]) -> list[list[float]]:
+    """Return the rows of a CSV file."""
+    lines = read_columns(path, "a table of gazes", columns, MAX_FILE_BYTES)
+    rows = []
+    for number, cells in lines:
+        try:
+            rows.append([float(cell) for cell in cells])
+        except ValueError:
+            raise FileError(path, f"must have numbers in line {number}, got {', '.join(cells)[:60]}") from None
+    problem = _problem_of_rows(rows, [f"line {number}" for number, _ in lines], columns)
+    if problem is not None:
+        raise FileError(path, problem)
+    return rows
+
+
+def _problem_of_rows(
+    rows: Sequence[Sequence[float]] | Floats, names: Sequence[str], columns: tuple[str, ...] = COLUMNS
+) -> str | None:
     """Return the first problem of rows with names such as "row 1"; None if they are a path."""
     if len(rows) == 0:
-        return "must have one or more rows [t_s, x_um, y_um]"
+        return f"must have one or more rows [{', '.join(columns)}]"
     before_s = -math.inf
     for k, (row, name) in enumerate(zip(rows, names, strict=True)):
         if not _is_row(row):
-            return f"must have three finite numbers, t_s, x_um and y_um, in {name}, got {format_value(row)}"
+            listed = f"{', '.join(columns[:2])} and {columns[2]}"
+            return f"must have three finite numbers, {listed}, in {name}, got {format_value(row)}"
         if row[0] <= before_s:
             return (
                 f"must have times in strictly ascending order, got {row[0]:g} s in {name} after {before_s:g} s in "
@@ -294,14 +409,68 @@ def shift_sensor(source: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Sce
     return TimedFrames(((source, position_um) for position_um in positions_um), FrameTimes(None, path.t_s))
 
 
+def turn_camera(scene: Scene, path: DirectionPath) -> Iterator[Scene]:
+    """
+    Yield frames of a static panorama for a camera that turns.
+
+    The frames are for :meth:`foveasim.Camera.video`. The image of each direction is computed once; equal directions that follow
+    each other share it.
+
+    Parameters
+    ----------
+    scene : Scene
+        A panorama.
+    path : DirectionPath
+        Directions of the camera from the orientation of the scene.
+
+    Yields
+    ------
+    Scene
+
+    Raises
+    ------
+    ParameterError
+        Immediately when the scene is not a panorama.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> import numpy as np
+    >>> scene = fs.Scene.from_panorama(np.ones((16, 32)), luminance_cd_m2=100.0)
+    >>> path = fs.video.DirectionPath(
+    ...     np.array([0.0, 0.1]), np.array([[0.0, 0.0], [30.0, 10.0]])
+    ... )
+    >>> [frame.panorama.gaze_deg for frame in fs.video.turn_camera(scene, path)]
+    [(0.0, 0.0), (30.0, 10.0)]
+    """
+    _seen_towards(scene, (0.0, 0.0))  # an error of the scene is raised here
+    return TimedFrames(_turned(scene, path), FrameTimes(None, path.t_s))
+
+
+def _turned(scene: Scene, path: DirectionPath) -> Iterator[Scene]:
+    """Yield a panorama along a path."""
+    frame: Scene | None = None
+    for azimuth_deg, elevation_deg in path.direction_deg.tolist():
+        gaze_deg = (azimuth_deg, elevation_deg)
+        if frame is None or frame.panorama is None or frame.panorama.gaze_deg != gaze_deg:
+            frame = _seen_towards(scene, gaze_deg)
+        yield frame
+
+
+def _seen_towards(scene: Scene | PowerMap, gaze_deg: tuple[float, float]) -> Scene:
+    if not isinstance(scene, Scene):
+        raise ParameterError("scene", "must be a panorama for a path of directions, got a power map; use a GazePath")
+    return scene.turned(gaze_deg=gaze_deg)
+
+
 def follow_gaze(
     frames: Iterable[Scene | PowerMap],
-    path: GazePath,
+    path: GazePath | DirectionPath,
     *,
     frame_s: Annotated[float | None, DURATION] = None,
     first_frame: Annotated[int, NOT_NEGATIVE] = 0,
     times_s: ArrayLike | None = None,
-) -> Iterator[tuple[Scene | PowerMap, tuple[float, float]]]:
+) -> Iterator[Frame]:
     """
     Yield frames of a changing scene along a gaze path.
 
@@ -311,7 +480,8 @@ def follow_gaze(
     ----------
     frames : iterable of Scene or PowerMap
         Frames of a video, such as a :class:`FrameSource`.
-    path : GazePath
+    path : GazePath or DirectionPath
+        With directions, the frames are panoramas.
     frame_s : float, s
         Frame period.
     first_frame : int
@@ -321,7 +491,7 @@ def follow_gaze(
 
     Yields
     ------
-    light, (x_um, y_um)
+    light, (x_um, y_um); along directions, panoramas
 
     Raises
     ------
@@ -353,13 +523,13 @@ def follow_gaze(
 
 
 def _followed(
-    frames: Iterable[Scene | PowerMap], path: GazePath, times: FrameTimes, first: int
-) -> Iterator[tuple[Scene | PowerMap, tuple[float, float]]]:
+    frames: Iterable[Scene | PowerMap], path: GazePath | DirectionPath, times: FrameTimes, first: int
+) -> Iterator[Frame]:
     """Yield frames with the gaze at their times."""
     for n, light in enumerate(frames, first):
         times.check_number(n)
-        x_um, y_um = path.at(times.at_s(n)).tolist()
-        yield light, (x_um, y_um)
+        x, y = path.at(times.at_s(n)).tolist()
+        yield (light, (x, y)) if isinstance(path, GazePath) else _seen_towards(light, (x, y))
 
 
 def pan_camera(

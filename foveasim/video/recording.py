@@ -54,7 +54,17 @@ NO_FRAME = -1
 NO_PATH = bytes(DIGEST_BYTES).hex()
 #: Settings that may always differ between captures of one recording.
 FRAME_SETTINGS = frozenset(
-    {"exposure_s", "frame", "time_s", "light.source", "place_um", "gaze_um", "gaze_path", "next_gaze_path"}
+    {
+        "exposure_s",
+        "frame",
+        "time_s",
+        "light.source",
+        "light.panorama.gaze_deg",
+        "place_um",
+        "gaze_um",
+        "gaze_path",
+        "next_gaze_path",
+    }
 )
 
 

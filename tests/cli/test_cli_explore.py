@@ -287,7 +287,9 @@ def test_study_interrupted_twice_resumes_identically(foveasim, folder, monkeypat
     n_stop = n_begun(folder / "study.db")
 
     assert code == 130
-    assert said == "interrupted; finished trials are stored in study.db, run the same command again to resume\n"
+    assert said.endswith(
+        "interrupted; finished trials are stored in study.db, run the same command again to resume\n"
+    )  # after what Optuna may say about the trial that ends
     assert 4 <= n_stop < 14
 
     code, _ = ended(signal.SIGKILL, folder, n_stop + 4)

@@ -155,6 +155,22 @@ def test_fisheye_directions_match_opencv():
     assert np.abs(lens.direction(at_um) - d).max() < 1e-9
 
 
+def test_unified_directions_match_opencv_beyond_90_degrees():
+    cv2 = pytest.importorskip("cv2")
+    if not hasattr(cv2, "omnidir"):
+        pytest.skip("cv2.omnidir is part of opencv-contrib-python")
+    lens = Omnidirectional(xi=1.1, focal_um=FOCAL_UM, k1=-0.05, k2=0.004, p1=-0.001, p2=0.002)
+    d = directions_up_to(105.0)
+    matrix = np.diag([2.1 * FOCAL_UM, 2.1 * FOCAL_UM, 1.0])
+    down = (d * [1.0, -1.0, 1.0])[np.newaxis]
+    at = cv2.omnidir.projectPoints(
+        down, np.zeros(3), np.zeros(3), matrix, 1.1, np.array([[-0.05, 0.004, 0.001, 0.002]])
+    )[0]
+    at_um = at.reshape(-1, 2) * [1.0, -1.0]
+    np.testing.assert_allclose(lens.project(d), at_um, atol=1e-8)
+    assert np.abs(lens.direction(at_um) - d).max() < 1e-9
+
+
 def test_scaramuzza_directions_match_ocamcalib_beyond_90_degrees():
     """OCamCalib's cam2world: the ray of the point (x, y) is (x, y, f(r)), after the inverse of the stretch."""
     a, pixel_um = (-209.2, 0.0, 0.00213, -4.2e-06, 1.77e-08), 2.0

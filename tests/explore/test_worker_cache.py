@@ -250,6 +250,7 @@ def leaves(model, section, prefix=""):
             "sensor.datasheet",
             "sensor.twin",
             "scene.gaze_range_um",
+            "gaze_deg",
             *LEVELS,
         )
         if name in ("kind", "generator") or path in in_sections:
@@ -405,3 +406,26 @@ def test_layouts_of_twins_are_not_confused(runner, tmp_path):
     base = {name: value for name, value in SHOT.items() if name != "layout"} | {"sensor": {"twin": "twin.npz"}}
 
     assert compare_with_fresh(runner, base, [("sensor.twin", "other.npz"), ("sensor.bits", 10)]) == set()
+
+
+def test_images_of_panoramas_are_not_confused(runner, tmp_path):
+    """The image of a panorama depends on the lens model and the layout, too."""
+    write_picture(tmp_path / "sky.png", np.random.default_rng(1).integers(0, 256, (16, 32), dtype=np.uint8))
+    base = SHOT | {
+        "scene": {"kind": "panorama", "picture": "sky.png", "peak_radiance_w_m2_sr_nm": 0.004, "cells": 32},
+        "distortion": {"kind": "fisheye", "projection": "equidistant", "focal_um": 30.0, "centre_um": [0.5, 0.0]},
+    }
+    changes = {
+        "gaze_deg": [70.0, 20.0],
+        "gaze_um": [1.0, 0.0],
+        "distortion.projection": "stereographic",
+        "distortion.focal_um": 40.0,
+        "layout.parameters.r_max_um": 20.0,
+        "optics.pupil_tilt": "flat",
+        "optics.projection": "equisolid",
+        "scene.yaw_deg": 30.0,
+    }
+    turning = base | {"axis": "sensor", "gaze_um": [3.0, 2.0]}
+
+    assert compare_with_fresh(runner, base, changes.items()) == set()
+    assert compare_with_fresh(runner, turning, [("gaze_um", [3.0, 2.5]), ("distortion.focal_um", 40.0)]) == set()

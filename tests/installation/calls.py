@@ -196,6 +196,14 @@ class Objects:
         return fs.video.GazePath([0.0, 0.1], [[0.0, 0.0], [2.0, 0.0]])
 
     @cached_property
+    def panorama(self):
+        return fs.Scene.from_panorama(np.ones((8, 16)), luminance_cd_m2=10.0)
+
+    @cached_property
+    def directions(self):
+        return fs.video.DirectionPath([0.0, 0.1], [[0.0, 0.0], [20.0, 5.0]])
+
+    @cached_property
     def report(self):
         return self.layout.check(fs.DesignRules(min_size_um=4.0))
 
@@ -392,9 +400,7 @@ CALLS = {
     "Scene.from_display": lambda o: fs.Scene.from_display(
         o.photos / "cats" / "0.png", "oled", distance_m=0.5, subpixels=True
     ).on_display(o.photos / "cats" / "1.png"),
-    "Scene.from_panorama": lambda o: o.camera.projection(
-        fs.Scene.from_panorama(np.ones((8, 16)), luminance_cd_m2=10.0).turned(yaw_deg=20.0)
-    ),
+    "Scene.from_panorama": lambda o: o.camera.projection(o.panorama.turned(yaw_deg=20.0)),
     "Scene.from_rgbd": lambda o: fs.Optics(focal_length_mm=8.0, f_number=2.8).power_map(
         fs.Scene.from_rgbd(
             np.ones((8, 8)), np.full((8, 8), 1.0), pitch_um=100.0, distance_m=0.5, peak_radiance_w_m2_sr_nm=0.05
@@ -650,6 +656,7 @@ CALLS = {
     "reconstruct.natural": lambda o: reconstruct.natural(o.layout, o.expected_e, o.grid),
     "reconstruct.raster_grid": lambda o: reconstruct.raster_grid(o.layout, 32),
     "reconstruct.reference": lambda o: reconstruct.reference(o.power_map, o.grid),
+    "reconstruct.unwrap": lambda o: reconstruct.unwrap(o.picture, o.lens, max_pixels=32),
     "reconstruct.to_cortical": lambda o: reconstruct.to_cortical(o.picture, n_rings=4, n_sectors=8, r_max_um=10.0),
     "scene.charts.bar_elements": lambda o: charts.bar_elements((0,)),
     "scene.charts.bars": lambda o: charts.bars(groups=(3,), **SHEET),
@@ -735,15 +742,18 @@ CALLS = {
     "units.volts_to_electrons": lambda o: units.volts_to_electrons(LENGTH, 1e-15),
     "units.w_from_w_m2_um2": lambda o: units.w_from_w_m2_um2(LENGTH),
     "video.count_recorded_frames": lambda o: video.count_recorded_frames(o.recording),
+    "video.DirectionPath": lambda o: o.directions.at(0.05),
     "video.FrameSource": lambda o: list(
         video.FrameSource(o.photos / "cats", frame_s=0.1, pitch_um=50.0, distance_m=0.5, peak_radiance_w_m2_sr_nm=0.05)
     ),
     "video.follow_gaze": lambda o: list(video.follow_gaze([o.scene] * 2, o.gaze, frame_s=0.1)),
     "video.pan_camera": lambda o: list(video.pan_camera(o.scene, o.gaze, o.optics, shape=(40, 40))),
     "video.partial_path": lambda o: video.partial_path("video.zarr"),
+    "video.read_gaze_path": lambda o: video.read_gaze_path(o.written(".csv", o.gaze.write)),
     "video.read_recording": lambda o: video.read_recording(o.recording).code[0],
     "video.saccades": lambda o: video.saccades(duration_s=1.0, frame_s=0.1, size_um=(10.0, 10.0), seed=0),
     "video.shift_sensor": lambda o: list(video.shift_sensor(o.scene, o.gaze)),
+    "video.turn_camera": lambda o: list(video.turn_camera(o.panorama, o.directions)),
     "video.write_video": lambda o: [
         video.write_video([o.capture] * 2, o.path(suffix), frame_s=0.1) for suffix in (".gif", "")
     ],

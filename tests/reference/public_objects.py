@@ -140,7 +140,7 @@ def public_objects(directory):
         effects.TelegraphMap(MANY), effects.RowNoise(2.0), effects.ColumnNoise(2.0),
         reconstruct.SiteEstimates(light_e=MANY, variance_e2=MANY, is_saturated=MANY > 0.5),
         video.FrameSource([np.zeros((8, 8), np.uint8)] * 3, frame_s=0.1, pitch_um=50.0, distance_m=0.5, peak_radiance_w_m2_sr_nm=0.05, band_width_nm=10.0),
-        video.GazePath(np.arange(100.0), np.zeros((100, 2))),
+        video.GazePath(np.arange(100.0), np.zeros((100, 2))), video.DirectionPath(np.arange(100.0), np.zeros((100, 2))),
         video.Recording(np.zeros((9, 1200)), MANY, np.arange(9), np.zeros((9, 2)), SITES, ("all",), np.zeros(1200, np.int64), 8, np.ones(1), {}, np.full(9, np.nan)),
         modes.EventPixels(SENSOR), modes.Events(np.zeros(3), np.zeros(3, np.int32), np.ones(3, np.int8), SITES),
         twin.StepResponses(0.1 + 0.001 * MANY, np.full(MANY.size, 9), np.ones((MANY.size, 9), np.int64)), STATIC, twin.fit_event_pixels(static=[STATIC]),

@@ -70,7 +70,7 @@ Seed = int | Literal["shot"]
 OF_SHOT: Final = "shot"
 #: Settings of the photosites and their integration areas, and settings of the optical image.
 GEOMETRY_SETTINGS = ("layout", "distortion", "integration_order", "gaze_um")
-IMAGE_SETTINGS = ("scene", "optics", "sensor.qe", "sensor.filters")
+IMAGE_SETTINGS = ("scene", "optics", "sensor.qe", "sensor.filters", "gaze_deg")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

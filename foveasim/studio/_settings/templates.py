@@ -72,6 +72,9 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "overlay kind": {
         "layer": {"generator": "grid", "parameters": {"n_x": 20, "n_y": 20, "pitch_um": 4.0}}, "operation": "replace",
     },
+    "panorama kind": {
+        "mapping": "fisheye", "lens": {"kind": "fisheye", "projection": "equidistant", "focal_um": 1630.0}, "pixel_um": 10.0,
+    },
     "pass_band kind": {"from_nm": 420.0, "to_nm": 680.0},
     "point_grid kind": {"spacing_mm": 16.0, "pitch_um": 500.0},
     "point_sources kind": {"pixels": [[256, 256]]},
