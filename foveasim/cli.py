@@ -617,7 +617,10 @@ def video(
         Path | None,
         typer.Option(
             "--gaze",
-            help="CSV file of a gaze path with the columns t_s, x_um and y_um, instead of gaze_path or gaze_um.",
+            help=(
+                "CSV file of a gaze path with the columns t_s, x_um and y_um, or t_s, azimuth_deg and elevation_deg, instead "
+                "of gaze_path, gaze_um or gaze_deg."
+            ),
         ),
     ] = None,
     threads: Threads = None,

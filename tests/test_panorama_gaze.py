@@ -159,6 +159,13 @@ def test_settings_files_turn_the_camera(tmp_path, camera):
     again = shot.camera.capture(scene, exposure_s=0.001, seed=0, frame=1, gaze_deg=(90.0, 10.0)).code
     np.testing.assert_array_equal(code, again)
 
+    moving = tmp_path / "moving.yaml"
+    moving.write_text(SHOT.replace("gaze_deg: [70.0, -20.0]", "gaze_path: gaze.csv"))
+    names: dict = {}
+    exec(to_python(yaml.safe_load(moving.read_text()), source=moving), names)
+    assert fs.config.read_shot(moving).gaze_path.rows.tolist() == path.rows.tolist()
+    np.testing.assert_array_equal(list(names["video"])[1].code, again)
+
     (tmp_path / "gaze.csv").write_text("t_s,azimuth_deg,elevation_deg\n0,0,95\n")
     with pytest.raises(FileError, match="the elevation, within ±90"):
         read_gaze_path(tmp_path / "gaze.csv")

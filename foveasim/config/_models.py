@@ -330,7 +330,8 @@ def _models(_versions: tuple[int, ...]) -> Models:
                 None,
                 description=(
                     "gaze of the frames of a video (foveasim video): rows [t_s, x_um, y_um], with straight lines between "
-                    "them, or a CSV file with these columns; a single capture has the gaze gaze_um"
+                    "them, or a CSV file with these columns, or with t_s, azimuth_deg and elevation_deg in a panorama; a "
+                    "single capture has the gaze gaze_um"
                 ),
             ),
         ),

@@ -45,7 +45,7 @@ from foveasim.scene import Scene
 from foveasim.scene._scene import FRAMINGS
 from foveasim.sensor import Sensor
 from foveasim.sensor.limits import ALTERNATIVES
-from foveasim.video import GazePath
+from foveasim.video import DirectionPath, GazePath, read_gaze_path
 from foveasim.video.frame_source import read_times
 
 #: Prefix of the names of pictures that scikit-image contains.
@@ -143,9 +143,9 @@ class Shot:
     __repr__ = short_repr
 
     @cached_property
-    def gaze_path(self) -> GazePath | None:
+    def gaze_path(self) -> GazePath | DirectionPath | None:
         """Gaze path of videos; a CSV file is read when the path is first required."""
-        return GazePath.read(self.gaze_source) if isinstance(self.gaze_source, Path) else self.gaze_source
+        return read_gaze_path(self.gaze_source) if isinstance(self.gaze_source, Path) else self.gaze_source
 
     @cached_property
     def times_s(self) -> Floats | None:

@@ -18,6 +18,8 @@ from foveasim.config._objects import FILE_SETTINGS, resolve_files
 from foveasim.config._problems import plain_settings, validate
 from foveasim.config._sources import Source
 from foveasim.layout import LAYOUTS, Layout
+from foveasim.video import DirectionPath
+from foveasim.video.gaze import path_class
 
 #: Modules with public names, in the order of preference, and their names in the source.
 MODULES = {
@@ -93,7 +95,10 @@ def to_python(settings: Mapping[str, Any], *, source: Source | str | Path | None
         if getattr(shot.layout, "rules", None) is not None:
             lines += ["rules = shot.rules", CHECK]
         if shot.gaze_path is not None:
-            lines += ["gaze_path = shot.gaze_path", _video_line(writer, _Name("shot.requested_s"), _Name("shot.seed"))]
+            lines += [
+                "gaze_path = shot.gaze_path",
+                _video_line(writer, shot.gaze_path, _Name("shot.requested_s"), _Name("shot.seed")),
+            ]
     imports = ["import foveasim as fs", *sorted(writer.imports)]
     return "\n".join([HEADER, *imports, "", *lines, ""])
 
@@ -138,16 +143,18 @@ def _gaze_lines(writer: _Writer, shot: Any) -> list[str]:
     """Return the lines that define the gaze path of a shot, and its captures."""
     if shot.gaze_path is None:
         return []
-    call = "fs.video.GazePath." + ("read" if isinstance(shot.gaze_path, str) else "from_rows")
+    call = "fs.video." + ("read_gaze_path" if isinstance(shot.gaze_path, str) else "GazePath.from_rows")
     return [
         f"gaze_path = {writer.call(call, {'value': shot.gaze_path}, positional=('value',))}",
-        _video_line(writer, shot.exposure_s, shot.seed),
+        _video_line(writer, shot.gaze_path, shot.exposure_s, shot.seed),
     ]
 
 
-def _video_line(writer: _Writer, exposure_s: Any, seed: Any) -> str:
-    """Return the line that defines the captures along a gaze path."""
-    frames = {"frames": _Name("fs.video.shift_sensor(scene, gaze_path)"), "exposure_s": exposure_s, "seed": seed}
+def _video_line(writer: _Writer, path: list[list[float]] | str, exposure_s: Any, seed: Any) -> str:
+    """Return the line that defines the captures along a gaze path, in rows or a file."""
+    is_turn = isinstance(path, str) and path_class(Path(path)) is DirectionPath
+    name = "turn_camera" if is_turn else "shift_sensor"
+    frames = {"frames": _Name(f"fs.video.{name}(scene, gaze_path)"), "exposure_s": exposure_s, "seed": seed}
     return f"video = {writer.call('camera.video', frames, positional=('frames',))}"
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,15 +44,130 @@ FIXATION_SHAPE = 4.0
 MIN_FIXATION = 0.2
 #: Upper limit of points; longer paths indicate wrong units.
 MAX_POINTS = 10**8
-#: Columns of a file, and its size limit.
-MAX_HEADER_BYTES = 65536
-COLUMNS, MAX_FILE_BYTES = ("t_s", "x_um", "y_um"), 1 << 28
-#: Columns of a file of directions.
-DIRECTION_COLUMNS = ("t_s", "azimuth_deg", "elevation_deg")
+#: Largest files, and their first lines.
+MAX_FILE_BYTES, MAX_HEADER_BYTES = 1 << 28, 65536
 
 
-@dataclass(frozen=True, eq=False)
-class GazePath:
+class _TimedPath:
+    """Two coordinates as a function of time, with straight lines between the points of an attribute."""
+
+    #: Columns of files and rows, and attribute of the coordinates.
+    COLUMNS: ClassVar[tuple[str, str, str]]
+    POINTS: ClassVar[str]
+
+    t_s: Floats
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        times_s = finite_array("t_s", self.t_s, ndim=1)
+        points = finite_array(self.POINTS, getattr(self, self.POINTS), ndim=2)
+        if times_s.size == 0 or np.any(np.diff(times_s) <= 0.0):
+            raise ParameterError("t_s", "must be one or more times in strictly ascending order", times_s, "s")
+        if points.shape != (times_s.size, 2):
+            raise ParameterError(
+                self.POINTS, f"must have the shape ({times_s.size}, 2), one position per time, got {points.shape}"
+            )
+        self._check(points)
+        object.__setattr__(self, "t_s", read_only(times_s.copy()))
+        object.__setattr__(self, self.POINTS, read_only(points.copy()))
+
+    def _check(self, points: Floats) -> None:
+        """Raise ParameterError if points are out of range."""
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """
+        Read a path from a CSV file.
+
+        Parameters
+        ----------
+        path : path
+            UTF-8 text whose first line names the columns. Those of the class are read, others are ignored.
+
+        Raises
+        ------
+        FileError
+            When the file cannot be read, or is not such a table.
+        """
+        path = Path(path)
+        lines = read_columns(path, "a table of gazes", cls.COLUMNS, MAX_FILE_BYTES)
+        rows = []
+        for number, cells in lines:
+            try:
+                rows.append([float(cell) for cell in cells])
+            except ValueError:
+                raise FileError(path, f"must have numbers in line {number}, got {', '.join(cells)[:60]}") from None
+        problem = _problem_of_rows(rows, [f"line {number}" for number, _ in lines], cls.COLUMNS)
+        if problem is not None:
+            raise FileError(path, problem)
+        try:
+            return cls._of(rows)
+        except ParameterError as error:
+            raise FileError(path, error.detail) from None
+
+    @classmethod
+    def from_rows(cls, rows: OwnCheck[Sequence[Sequence[float]] | Floats]) -> Self:
+        """
+        Return the path of rows, as settings files contain them.
+
+        Parameters
+        ----------
+        rows : sequence of three numbers
+            Times in s, strictly ascending, and both coordinates, as the columns of files.
+
+        Raises
+        ------
+        ParameterError
+            When a row is not three finite numbers, or not later than the one before.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> path = fs.video.GazePath.from_rows([[0.0, 0.0, 0.0], [1.0, 100.0, 50.0]])
+        >>> path.at(0.25).tolist()
+        [25.0, 12.5]
+        """
+        problem = _problem_of_rows(rows, [f"row {k}" for k in range(1, len(rows) + 1)], cls.COLUMNS)
+        if problem is not None:
+            raise ParameterError("rows", problem)
+        return cls._of(rows)
+
+    @classmethod
+    def _of(cls, rows: Sequence[Sequence[float]] | Floats) -> Self:
+        """Return the path of valid rows."""
+        values = np.array(rows, dtype=float)
+        return cls(**{"t_s": values[:, 0], cls.POINTS: values[:, 1:]})
+
+    @property
+    def rows(self) -> Floats:
+        """Times and coordinates, (n, 3): see :meth:`from_rows`."""
+        return np.column_stack((self.t_s, getattr(self, self.POINTS)))
+
+    def write(self, path: str | Path) -> None:
+        """
+        Write the path to a CSV file, atomically: see :meth:`read`.
+
+        Raises
+        ------
+        FileError
+            When the file cannot be written.
+        """
+        with atomic_write(path) as temporary:
+            np.savetxt(temporary, self.rows, fmt="%.17g", delimiter=",", header=",".join(self.COLUMNS), comments="")
+
+    def at(self, t_s: ArrayLike) -> Floats:
+        """
+        Return the coordinates at given times, (..., 2), by linear interpolation.
+
+        Before the first and after the last point they are constant.
+        """
+        times_s, points = finite_array("t_s", t_s), getattr(self, self.POINTS)
+        return np.stack([np.interp(times_s, self.t_s, points[:, axis]) for axis in (0, 1)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GazePath(_TimedPath):
     """
     Gaze positions as a function of time.
 
@@ -79,93 +194,15 @@ class GazePath:
     [[25.0, 12.5]]
     """
 
+    COLUMNS = ("t_s", "x_um", "y_um")
+    POINTS = "xy_um"
+
     t_s: Floats
     xy_um: Floats
 
-    __repr__ = short_repr
 
-    def __post_init__(self) -> None:
-        t_s, xy_um = _checked_points(self.t_s, "xy_um", self.xy_um)
-        object.__setattr__(self, "t_s", t_s)
-        object.__setattr__(self, "xy_um", xy_um)
-
-    @classmethod
-    def read(cls, path: str | Path) -> GazePath:
-        """
-        Read a path from a CSV file.
-
-        Parameters
-        ----------
-        path : path
-            UTF-8 text whose first line names the columns. ``t_s``, ``x_um`` and ``y_um`` are read, others are ignored.
-
-        Raises
-        ------
-        FileError
-            When the file cannot be read, or is not such a table.
-        """
-        return cls._of(_read_rows(Path(path), COLUMNS))
-
-    @classmethod
-    def from_rows(cls, rows: OwnCheck[Sequence[Sequence[float]] | Floats]) -> GazePath:
-        """
-        Return the path of rows, as settings files contain them (``gaze_path``).
-
-        Parameters
-        ----------
-        rows : sequence of (t_s, x_um, y_um)
-            Times in s, strictly ascending, and positions in µm.
-
-        Raises
-        ------
-        ParameterError
-            When a row is not three finite numbers, or not later than the one before.
-
-        Examples
-        --------
-        >>> path = GazePath.from_rows([[0.0, 0.0, 0.0], [1.0, 100.0, 50.0]])
-        >>> path.at(0.25).tolist()
-        [25.0, 12.5]
-        """
-        problem = _problem_of_rows(rows, [f"row {k}" for k in range(1, len(rows) + 1)])
-        if problem is not None:
-            raise ParameterError("rows", problem)
-        return cls._of(rows)
-
-    @classmethod
-    def _of(cls, rows: Sequence[Sequence[float]] | Floats) -> GazePath:
-        """Return the path of valid rows."""
-        values = np.array(rows, dtype=float)
-        return cls(values[:, 0], values[:, 1:])
-
-    @property
-    def rows(self) -> Floats:
-        """Times and positions, (n, 3): see :meth:`from_rows`."""
-        return np.column_stack((self.t_s, self.xy_um))
-
-    def write(self, path: str | Path) -> None:
-        """
-        Write the path to a CSV file, atomically: see :meth:`read`.
-
-        Raises
-        ------
-        FileError
-            When the file cannot be written.
-        """
-        with atomic_write(path) as temporary:
-            np.savetxt(temporary, self.rows, fmt="%.17g", delimiter=",", header=",".join(COLUMNS), comments="")
-
-    def at(self, t_s: ArrayLike) -> Floats:
-        """
-        Return the positions at given times, (..., 2) µm, by linear interpolation.
-
-        Before the first and after the last point the position is constant.
-        """
-        return _interpolated(t_s, self.t_s, self.xy_um)
-
-
-@dataclass(frozen=True, eq=False)
-class DirectionPath:
+@dataclass(frozen=True, eq=False, repr=False)
+class DirectionPath(_TimedPath):
     """
     Directions of a camera that turns in a panorama, as a function of time.
 
@@ -192,25 +229,15 @@ class DirectionPath:
     [[45.0, 5.0]]
     """
 
+    COLUMNS = ("t_s", "azimuth_deg", "elevation_deg")
+    POINTS = "direction_deg"
+
     t_s: Floats
     direction_deg: Floats
 
-    __repr__ = short_repr
-
-    def __post_init__(self) -> None:
-        t_s, direction_deg = _checked_points(self.t_s, "direction_deg", self.direction_deg)
-        for each_deg in direction_deg.tolist():
-            check_direction("direction_deg", each_deg)
-        object.__setattr__(self, "t_s", t_s)
-        object.__setattr__(self, "direction_deg", direction_deg)
-
-    def at(self, t_s: ArrayLike) -> Floats:
-        """
-        Return the directions at given times, (..., 2) degrees, by linear interpolation.
-
-        Before the first and after the last point the direction is constant.
-        """
-        return _interpolated(t_s, self.t_s, self.direction_deg)
+    def _check(self, points: Floats) -> None:
+        for each_deg in points.tolist():
+            check_direction(self.POINTS, each_deg)
 
 
 def read_gaze_path(path: str | Path) -> GazePath | DirectionPath:
@@ -232,57 +259,21 @@ def read_gaze_path(path: str | Path) -> GazePath | DirectionPath:
     FileError
         When the file cannot be read, or is not such a table.
     """
-    path = Path(path)
+    return path_class(Path(path)).read(path)
+
+
+def path_class(path: Path) -> type[GazePath | DirectionPath]:
+    """Return the class of the path in a CSV file, by its columns; positions if there are no others."""
     try:
         with path.open("rb") as file:
-            is_direction = set(DIRECTION_COLUMNS) <= {
-                name.strip() for name in file.readline(MAX_HEADER_BYTES).decode("utf-8-sig", "replace").split(",")
-            }
+            names = file.readline(MAX_HEADER_BYTES).decode("utf-8-sig", "replace").split(",")
     except OSError:  # reported by the reader
-        is_direction = False
-    if not is_direction:
-        return GazePath.read(path)
-    values = np.array(_read_rows(path, DIRECTION_COLUMNS), dtype=float)
-    try:
-        return DirectionPath(values[:, 0], values[:, 1:])
-    except ParameterError as error:
-        raise FileError(path, error.detail) from None
-
-
-def _checked_points(t_s: ArrayLike, name: str, values: ArrayLike) -> tuple[Floats, Floats]:
-    """Return times (n,) and points (n, 2), read-only."""
-    times_s, points = finite_array("t_s", t_s, ndim=1), finite_array(name, values, ndim=2)
-    if times_s.size == 0 or np.any(np.diff(times_s) <= 0.0):
-        raise ParameterError("t_s", "must be one or more times in strictly ascending order", times_s, "s")
-    if points.shape != (times_s.size, 2):
-        raise ParameterError(
-            name, f"must have the shape ({times_s.size}, 2), one position per time, got {points.shape}"
-        )
-    return read_only(times_s.copy()), read_only(points.copy())
-
-
-def _interpolated(at_s: ArrayLike, t_s: Floats, points: Floats) -> Floats:
-    times_s = finite_array("t_s", at_s)
-    return np.stack([np.interp(times_s, t_s, points[:, axis]) for axis in (0, 1)], axis=-1)
-
-
-def _read_rows(path: Path, columns: tuple[str, ...]) -> list[list[float]]:
-    """Return the rows of a CSV file."""
-    lines = read_columns(path, "a table of gazes", columns, MAX_FILE_BYTES)
-    rows = []
-    for number, cells in lines:
-        try:
-            rows.append([float(cell) for cell in cells])
-        except ValueError:
-            raise FileError(path, f"must have numbers in line {number}, got {', '.join(cells)[:60]}") from None
-    problem = _problem_of_rows(rows, [f"line {number}" for number, _ in lines], columns)
-    if problem is not None:
-        raise FileError(path, problem)
-    return rows
+        return GazePath
+    return DirectionPath if set(DirectionPath.COLUMNS) <= {name.strip() for name in names} else GazePath
 
 
 def _problem_of_rows(
-    rows: Sequence[Sequence[float]] | Floats, names: Sequence[str], columns: tuple[str, ...] = COLUMNS
+    rows: Sequence[Sequence[float]] | Floats, names: Sequence[str], columns: tuple[str, ...]
 ) -> str | None:
     """Return the first problem of rows with names such as "row 1"; None if they are a path."""
     if len(rows) == 0:
@@ -305,7 +296,7 @@ def _is_row(row: Any) -> bool:
     """Return whether an object is a time and a position."""
     return (
         isinstance(row, list | tuple | np.ndarray)
-        and len(row) == len(COLUMNS)
+        and len(row) == 3
         and all(isinstance(x, int | float | np.number) and not isinstance(x, bool) and math.isfinite(x) for x in row)
     )
 

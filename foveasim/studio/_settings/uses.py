@@ -16,7 +16,7 @@ from foveasim.maps import MAP_FORMATS
 from foveasim.optics import PSF_FORMATS
 from foveasim.scene.cubes import CUBE_FORMATS
 from foveasim.twin.frames.result import FILE_FORMAT as TWIN_FORMAT
-from foveasim.video.gaze import COLUMNS as GAZE_COLUMNS
+from foveasim.video import GazePath
 
 __all__ = ["PLACES", "Use", "use_of"]
 
@@ -62,7 +62,7 @@ def use_of(path: Path) -> Use:
     if path.suffix.lower() in PICTURE_EXTENSIONS:
         return "scene"
     first = text.partition(b"\n")[0].decode("latin-1").strip().lower()
-    if set(first.split(",")).issuperset(GAZE_COLUMNS):
+    if set(first.split(",")).issuperset(GazePath.COLUMNS):
         return "gaze"
     if first.isprintable() and not found:
         raise FileError(path, "is a text; choose it in the list of the setting that it is for, such as qe or filters")
