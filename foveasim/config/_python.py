@@ -150,7 +150,7 @@ def _gaze_lines(writer: _Writer, shot: Any) -> list[str]:
     ]
 
 
-def _video_line(writer: _Writer, path: list[list[float]] | str, exposure_s: Any, seed: Any) -> str:
+def _video_line(writer: _Writer, path: Any, exposure_s: Any, seed: Any) -> str:
     """Return the line that defines the captures along a gaze path, in rows or a file."""
     is_turn = isinstance(path, str) and path_class(Path(path)) is DirectionPath
     name = "turn_camera" if is_turn else "shift_sensor"
