@@ -300,7 +300,7 @@ from foveasim._core import jit
 jit.kernel_modules = lambda: ["foveasim.layout.files._kernels", "foveasim.scene._kernels"]
 print(jit.compile_kernels(n_workers={n_workers}))
 """
-    assert run(program, tmp_path)[0] == "7"
+    assert run(program, tmp_path)[0] == "8"
     stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb[ic]")}
 
     assert (

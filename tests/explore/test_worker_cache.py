@@ -122,6 +122,8 @@ ABERRATIONS = (
 )
 #: Alternatives of the radiance of a scene.
 LEVELS = ("scene.luminance_cd_m2", "scene.illuminance_lux", "scene.reflectance")
+#: Settings without effect on planes.
+OF_PANORAMAS = {"gaze_deg", "optics.projection", "optics.pupil_tilt"}
 #: Other values of settings whose type does not suggest one.
 OTHERS = {
     "times_s": [0.0, 0.05],
@@ -378,7 +380,7 @@ def test_cached_components_equal_fresh_ones(runner):
     unchanged = compare_with_fresh(runner, SHOT, values)
 
     # Settings without effect would show no wrong component.
-    assert len(unchanged) < 0.1 * len(values), unchanged
+    assert len(unchanged - OF_PANORAMAS) < 0.1 * len(values), unchanged
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ def _gaze_of(result: Simulated) -> tuple[Any, ...]:
     return source, camera.layout, camera.optics, camera.distortion, numbers
 
 
-@part("Panorama", _gaze_of, order=83, group="See", is_lazy=True)
+@part("Panorama", _gaze_of, order=980, group="Explore", is_lazy=True)
 def panorama(result: Simulated) -> PartData:
     """Return the panorama, 360° by 180°, darker outside the field of the sensor."""
     camera, scene = result.shot.camera, result.shot.scene

@@ -84,6 +84,8 @@ def main(out_dir: Path, n_y: int = 1024, n_sectors: int = N_SECTORS) -> None:
     angle_deg = np.degrees(np.hypot(*layout.centroid_um.T) / FOCAL_UM)
     n_near = int(np.median(angle_deg))
     print(f"{layout.n_sites:,} photosites, half of them within {n_near}°")
+    assert n_near < 20.0
+    assert angle_deg.max() > 90.0
 
     # %% The camera turns to two directions.
     captures = [
@@ -106,7 +108,7 @@ def main(out_dir: Path, n_y: int = 1024, n_sectors: int = N_SECTORS) -> None:
             ax.imshow(picture.to_image(background="black"), cmap="gray")
             ax.set_title(title, fontsize=13)
             ax.set_axis_off()
-    save_figure(figure, out_dir / "40_omnidirectional_fovea.png")
+    save_figure(figure, out_dir / "39_omnidirectional_fovea.png")
 
 
 if __name__ == "__main__":

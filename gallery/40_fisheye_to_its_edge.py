@@ -24,7 +24,7 @@ import foveasim as fs
 from foveasim.view import save_figure
 
 sys.path.insert(0, str(Path(__file__).parent))
-town = import_module("40_omnidirectional_fovea").town
+town = import_module("39_omnidirectional_fovea").town
 sys.path.pop(0)
 
 #: A calibration of the camera Kodak PIXPRO SP360 4K by OCamCalib, at 1440 x 1440
@@ -90,6 +90,8 @@ def main(out_dir: Path, n_y: int = 1024, binning: int = BINNING) -> None:
     print(f"image: {camera.projection(scene)}, up to {corner_deg:.0f}°")
     print(f"beyond 90°: {100.0 * is_behind.mean():.0f} % of the photosites")
     print(f"dark: {100 * dark['turning']:.0f} %, flat pupil {100 * dark['flat']:.0f} %")
+    assert dark["turning"] == 0.0
+    assert dark["flat"] > is_behind.mean() > 0.4
 
     # %% The fisheye picture with its circle of 90°, and the same as a panorama.
     azimuth = np.linspace(0.0, 2.0 * np.pi, 361)
@@ -107,7 +109,7 @@ def main(out_dir: Path, n_y: int = 1024, binning: int = BINNING) -> None:
         row[1].set_title("unwrapped around the axis", fontsize=13)
         for ax in row:
             ax.set_axis_off()
-    save_figure(figure, out_dir / "41_fisheye_to_its_edge.png")
+    save_figure(figure, out_dir / "40_fisheye_to_its_edge.png")
 
 
 if __name__ == "__main__":
