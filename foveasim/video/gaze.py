@@ -49,7 +49,7 @@ MAX_FILE_BYTES, MAX_HEADER_BYTES = 1 << 28, 65536
 
 
 class _TimedPath:
-    """Two coordinates as a function of time, with straight lines between the points of an attribute."""
+    """Points as a function of time, with straight lines between them."""
 
     #: Columns of files and rows, and attribute of the coordinates.
     COLUMNS: ClassVar[tuple[str, str, str]]
@@ -263,7 +263,7 @@ def read_gaze_path(path: str | Path) -> GazePath | DirectionPath:
 
 
 def path_class(path: Path) -> type[GazePath | DirectionPath]:
-    """Return the class of the path in a CSV file, by its columns; positions if there are no others."""
+    """Return the class of the path in a CSV file, by its columns."""
     try:
         with path.open("rb") as file:
             names = file.readline(MAX_HEADER_BYTES).decode("utf-8-sig", "replace").split(",")
