@@ -59,7 +59,7 @@ def read_depth(
     """
     Return distances (n_y, n_x), m, bottom row first.
 
-    ``depth``: array or file, top row first.     Raises ParameterError or FileError.
+    ``depth``: array or file, top row first. Raises ParameterError or FileError.
     """
     if depth_scale is not None and depth_format is not None:
         raise ParameterError("depth_scale", "must not be given together with 'depth_format'", depth_scale)
@@ -105,7 +105,7 @@ def _read(path: Path) -> tuple[NDArray[Any], bool]:
             return read_channels(path, found)[0], True
     if path.suffix.lower() == ".npy":
         with as_file_error(path, "depth file", passes=(ParameterError,)):
-            return as_numbers("depth_m", np.load(path, allow_pickle=False), keep_type=True), False
+            return as_numbers("depth_m", np.load(path, mmap_mode="r", allow_pickle=False), keep_type=True), False
     values = read_picture(path)
     if values.ndim != 2:
         raise FileError(path, f"must have one channel of distances, got the shape {values.shape}")

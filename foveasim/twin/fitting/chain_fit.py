@@ -20,10 +20,8 @@ from foveasim.twin.fitting.starts import Start, first_values
 
 __all__ = ["ChainFit", "fit_chain"]
 
-#: Standard error of the nonlinearity up to which it is fitted.
-MAX_NONLINEARITY_ERROR = 0.1
-#: Chi-square per degree of freedom from which a fit starts again, and noise and shifts of the black level there, in codes.
-UNEXPLAINED, OTHER_SIGMAS, OTHER_SHIFTS = 3.0, (0.2, 0.4), (-0.3, 0.0, 0.3)
+#: Standard error of the nonlinearity up to which it is fitted, and its largest value: more follows from levels of unknown light.
+MAX_BEND_ERROR, MAX_BEND = 0.1, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,34 +94,12 @@ def fit_chain(recording: Recording, defects: Defects, spread: Spread, before: Ch
         return ChainFit(found, levels, exposures, fixed_e, is_used, start, well_e, dnl_dn, bend)
 
     found = fit(names)
-    if before is None and found.chi_square > UNEXPLAINED:
-        width_dn = float(recording.adc.width_of_code_dn(levels.mean_dn.min()))
-        others = map(fit, _other_starts(names, width_dn))
-        found = min((found, *others), key=lambda each: each.chi_square)
-    if BEND in names and found.error(BEND) > MAX_NONLINEARITY_ERROR:
+    if BEND in names and (found.error(BEND) > MAX_BEND_ERROR or abs(found.values[BEND]) > MAX_BEND):
         bend = Uncertain(
             "the stacks have too few levels of known light: give their exposure times with a constant light, or photons"
         )
         found = fit({name: value for name, value in result(found).parameters.items() if name != BEND})
     return result(found)
-
-
-def _other_starts(names: Mapping[str, float], width_dn: float) -> list[dict[str, float]]:
-    """
-    Return first values with other noise and black levels.
-
-    Where noise is small against the codes, of ``width_dn``, the moments of dark frames are periodic in the black level, and the
-    likelihood has several maxima.
-    """
-    return [
-        {
-            **names,
-            "read_noise_e2": (sigma * width_dn / names["gain_dn_per_e"]) ** 2,
-            "black_level_dn": names["black_level_dn"] + shift * width_dn,
-        }
-        for sigma in OTHER_SIGMAS
-        for shift in OTHER_SHIFTS
-    ]
 
 
 def _variance_of(dnl_dn: Estimate | Uncertain) -> tuple[float, float]:

@@ -42,7 +42,8 @@ class Defects:
 
     ``is_hot``, ``is_dead`` (n_y, n_x). ``slopes``: of the dark current, or None without dark stacks of two exposure times and
     one temperature. ``telegraph``: RTS noise in ``telegraph_stack``, or None. ``rts_probability`` (n_y, n_x): of pixels.
-    ``step_dn``: difference of its states, in codes at the dark level.
+    ``step_dn``: difference of its states, in codes at the dark level. ``dark_variance_dn2``: median over pixels, which does not
+    contain RTS noise.
     """
 
     is_hot: Bools
@@ -52,6 +53,7 @@ class Defects:
     telegraph_stack: int
     rts_probability: Floats
     step_dn: float
+    dark_variance_dn2: float
 
 
 def find_defects(recording: Recording) -> tuple[Recording, Defects]:
@@ -61,8 +63,15 @@ def find_defects(recording: Recording) -> tuple[Recording, Defects]:
     recording = recording.without(is_hot)
     is_dead = _dead_pixels(recording)
     recording = recording.without(is_dead)
-    stack, telegraph, probability, step_dn = _telegraph(recording, slopes)
-    return recording, Defects(is_hot, is_dead, slopes, telegraph, stack, probability, step_dn)
+    stack = max(recording.shortest, key=lambda k: recording.statistics[k].n_frames)
+    variance_dn2 = float(np.median(recording.statistics[stack].variance_dn2))
+    telegraph = None if variance_dn2 < MIN_DARK_DN2 else _telegraph(recording, slopes, stack)
+    probability, step_dn = np.zeros(recording.classes.shape), 0.0
+    if telegraph is not None:
+        probability[recording.good] = telegraph.probability
+        code = np.median(recording.statistics[stack].mean_dn)
+        step_dn = telegraph.step_dn / float(recording.adc.width_of_code_dn(code))
+    return recording, Defects(is_hot, is_dead, slopes, telegraph, stack, probability, step_dn, variance_dn2)
 
 
 def _dark_slopes(recording: Recording) -> DarkSlopes | None:
@@ -100,26 +109,11 @@ def _dead_pixels(recording: Recording) -> Bools:
     return is_dead
 
 
-def _telegraph(recording: Recording, slopes: DarkSlopes | None) -> tuple[int, TelegraphFit | None, Floats, float]:
-    """Find RTS noise in the stack of most dark frames of the shortest exposure."""
-    at = max(recording.shortest, key=lambda k: recording.statistics[k].n_frames)
-    stack = recording.statistics[at]
-    probability = np.zeros(stack.shape)
-    if np.median(stack.variance_dn2) < MIN_DARK_DN2:
-        return at, None, probability, 0.0
-    # In linear codes: the steps of pixels with different offsets are nearly equal.
-    variance_dn2 = recording.linear[at].variance_dn2
-    variance_dn2 /= _shot_ratio(recording, slopes, at, variance_dn2)
-    telegraph = fit_telegraph(variance_dn2[recording.good], stack.n_frames)
-    if telegraph is None:
-        return at, None, probability, 0.0
-    probability[recording.good] = telegraph.probability
-    return (
-        at,
-        telegraph,
-        probability,
-        telegraph.step_dn / float(recording.adc.width_of_code_dn(np.median(stack.mean_dn))),
-    )
+def _telegraph(recording: Recording, slopes: DarkSlopes | None, stack: int) -> TelegraphFit | None:
+    """Find RTS noise in linear codes of a dark stack, in which steps are nearly equal."""
+    variance_dn2 = recording.linear[stack].variance_dn2
+    variance_dn2 /= _shot_ratio(recording, slopes, stack, variance_dn2)
+    return fit_telegraph(variance_dn2[recording.good], recording.statistics[stack].n_frames)
 
 
 def _shot_ratio(

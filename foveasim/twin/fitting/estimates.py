@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -55,7 +55,6 @@ class Results:
     defects: Defects
     chain: ChainFit
     pixels: Pixels
-    assumptions: list[str] = field(default_factory=list)
 
     @property
     def _blocks(self) -> int:
@@ -87,16 +86,23 @@ class Results:
             found["full_well_e"] = Uncertain(
                 f"no level is limited by it: the codes end at {top:.4g} e-, or the levels are too low"
             )
-        if self.recording.n_classes > 1:
-            self.assumptions.append(
-                "Colours have no spectral curves: sensor() has neutral filters with their responses to the lamp; give filters."
-            )
         found |= {
             name: self._mean(name, is_log=True) for name in fit.names if name.startswith(("qe", "dark_doubling_k"))
         }
         found |= self._dark() | self._hot_and_dead() | self._telegraph() | self._patterns() | self._lines()
         if isinstance(found["read_noise_e"], Uncertain):
             found |= dict.fromkeys(HIDDEN, found["read_noise_e"])
+        return found
+
+    def assumptions(self) -> list[str]:
+        """Return what was taken as known."""
+        found = []
+        if self.recording.n_classes > 1:
+            found.append(
+                "Colours have no spectral curves: sensor() has neutral filters with their responses to the lamp; give filters."
+            )
+        if "dark_e_per_s" not in self.chain.fit.names:
+            found.append("The dark current is part of the black level, as at the exposure time of the dark frames.")
         return found
 
     def maps(self) -> dict[str, Floats]:
@@ -132,7 +138,7 @@ class Results:
 
     def _read_noise(self) -> Estimate | Uncertain:
         levels, exposures, fit = self.chain.levels, self.chain.exposures, self.chain.fit
-        lowest_dn2 = float(levels.variance_dn2[exposures.is_dark].min())
+        lowest_dn2 = min(float(levels.variance_dn2[exposures.is_dark].min()), self.defects.dark_variance_dn2)
         if lowest_dn2 < MIN_DARK_DN2:
             return Uncertain(
                 f"the dark variance, {lowest_dn2:.2g} DN², is below {MIN_DARK_DN2} DN²: quantisation hides the noise; use a "
@@ -142,9 +148,6 @@ class Results:
 
     def _dark(self) -> Estimates:
         if "dark_e_per_s" not in self.chain.fit.names:
-            self.assumptions.append(
-                "The dark current is part of the black level, as at the exposure time of the dark frames."
-            )
             return dict.fromkeys(
                 ("dark_e_per_s", "dsnu_fraction"), Uncertain("it needs dark stacks of two exposure times")
             )

@@ -74,6 +74,6 @@ def fit_statistics(
         results.maps(),
         chain.levels,
         chain.fit,
-        results.assumptions,
+        results.assumptions(),
         min(temperatures, default=None),
     )

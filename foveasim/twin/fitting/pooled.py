@@ -88,11 +88,6 @@ class PooledFit:
     own_covariance: Floats
     residuals: Floats = field(default_factory=lambda: np.zeros(0))
 
-    @property
-    def chi_square(self) -> float:
-        """Sum of the squares of residuals per degree of freedom."""
-        return float(self.residuals @ self.residuals) / max(self.residuals.size - len(self.names), 1)
-
     def error(self, name: str, *, of_device: bool = False) -> float:
         """Return the standard error of a parameter; of a logarithm for positive ones."""
         matrix = self.own_covariance if of_device else self.covariance
