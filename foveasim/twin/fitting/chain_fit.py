@@ -20,7 +20,7 @@ from foveasim.twin.fitting.starts import Start, first_values
 
 __all__ = ["ChainFit", "fit_chain"]
 
-#: Standard error of the nonlinearity up to which it is fitted, and its largest value: more follows from levels of unknown light.
+#: Standard error of the nonlinearity up to which it is fitted, and its largest value.
 MAX_BEND_ERROR, MAX_BEND = 0.1, 0.3
 
 
