@@ -71,7 +71,8 @@ nb_execution_raise_on_error = True
 nb_execution_excludepatterns = (
     [] if find_spec("torch") else ["notebooks/dataset_in_pytorch.ipynb"]
 )
-autosummary_generate = True
+# Named, since a repeated build takes the pages that the build before found.
+autosummary_generate = [f"reference/{name}.md" for name in generated_pages.MODULES]
 autodoc_typehints = "none"  # numpydoc's parameter lists contain types, shapes and units
 numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False

@@ -261,6 +261,20 @@ class Incidence:
         """Tangents of the chief rays at the sites, (n_site, 2)."""
         return self._chief_rays_at(self.field_um + np.array(self.displacement_um))
 
+    @property
+    def largest_tangent(self) -> float:
+        """Largest tangent of a chief ray between the optical axis and the outermost site."""
+        if self.axes_um is None:
+            height_um = float(self.image_height_um.max(initial=0.0))
+        else:
+            ends = (np.abs(at + by).max(initial=0.0) for at, by in zip(self.axes_um, self.displacement_um, strict=True))
+            height_um = math.hypot(*ends)
+        if self.table is None:
+            return abs(height_um / self.exit_pupil_um)
+        knots_um = np.array(self.table.image_height_um)  # between them, tangents are monotonic
+        heights_um = np.append(knots_um[knots_um < height_um], min(height_um, knots_um[-1]))
+        return float(np.abs(_interpolant(self.table)(heights_um)).max())
+
     def design(self, table: ChiefRayTable | None = None) -> Floats:
         """
         Return the chief rays for which microlenses of the sensor are designed.

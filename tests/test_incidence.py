@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -31,6 +32,21 @@ def test_disc_cubature_is_exact_for_polynomials(n_rings, degree):
     for p in range(degree + 1):
         for q in range(degree + 1 - p):
             assert weights @ (x**p * y**q) == pytest.approx(disc_moment(p, q), abs=1e-14)
+
+
+@pytest.mark.parametrize("angle_deg", [(0.0, 12.0, 30.0, 22.0), (0.0, -5.0, -2.0, -1.0)])
+@pytest.mark.parametrize("is_table", [False, True])
+def test_largest_tangent_is_that_of_a_dense_grid(angle_deg, is_table):
+    table = fs.optics.ChiefRayTable(image_height_um=(0.0, 400.0, 1000.0, 2000.0), angle_deg=angle_deg)
+    optics = fs.Optics(focal_length_mm=8.0, f_number=2.0, chief_ray=table if is_table else None)
+    x_um, y_um = np.linspace(-700.0, 1100.0, 901), np.linspace(-300.0, 500.0, 401)
+    cone = replace(optics.incidence(FIELD_UM), displacement_um=(30.0, -250.0)).on_axes(x_um, y_um)
+    slope = np.hypot(*cone.chief_ray.T)
+
+    assert cone.largest_tangent == pytest.approx(slope.max(), rel=1e-5)
+    at = cone.at(np.stack(np.meshgrid(x_um, y_um), axis=-1).reshape(-1, 2))
+    assert at.largest_tangent == pytest.approx(slope.max(), rel=1e-5)
+    assert cone.at(np.zeros((0, 2))).largest_tangent == 0.0
 
 
 def test_chief_rays_come_from_exit_pupil():

@@ -273,7 +273,7 @@ def warn_of_oblique_rays(incidence: Incidence, warned: set[str]) -> None:
     if "chief rays" in warned:
         return
     warned.add("chief rays")
-    tangent = float(np.hypot(*incidence.chief_ray.T).max(initial=0.0))
+    tangent = incidence.largest_tangent
     if tangent > math.tan(math.radians(MAX_CHIEF_RAY_DEG)):
         warn(
             f"chief rays reach the sensor at up to {math.degrees(math.atan(tangent)):.0f}° to its normal, beyond "
