@@ -36,7 +36,7 @@ def test_disc_cubature_is_exact_for_polynomials(n_rings, degree):
 
 @pytest.mark.parametrize("angle_deg", [(0.0, 12.0, 30.0, 22.0), (0.0, -5.0, -2.0, -1.0)])
 @pytest.mark.parametrize("is_table", [False, True])
-def test_largest_tangent_is_that_of_a_dense_grid(angle_deg, is_table):
+def test_largest_tangent_of_chief_rays(angle_deg, is_table):
     table = fs.optics.ChiefRayTable(image_height_um=(0.0, 400.0, 1000.0, 2000.0), angle_deg=angle_deg)
     optics = fs.Optics(focal_length_mm=8.0, f_number=2.0, chief_ray=table if is_table else None)
     x_um, y_um = np.linspace(-700.0, 1100.0, 901), np.linspace(-300.0, 500.0, 401)

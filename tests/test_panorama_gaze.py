@@ -8,8 +8,10 @@ import yaml
 from PIL import Image
 
 import foveasim as fs
+from foveasim.compare.metrics import ComparedShot
 from foveasim.config import to_python
 from foveasim.errors import FileError, ParameterError
+from foveasim.metrics.registry import number_of
 from foveasim.scene._panorama import Panorama
 from foveasim.video import DirectionPath, follow_gaze, read_gaze_path, turn_camera
 
@@ -169,3 +171,47 @@ def test_settings_files_turn_the_camera(tmp_path, camera):
     (tmp_path / "gaze.csv").write_text("t_s,azimuth_deg,elevation_deg\n0,0,95\n")
     with pytest.raises(FileError, match="the elevation, within ±90"):
         read_gaze_path(tmp_path / "gaze.csv")
+
+
+@pytest.fixture
+def pair(camera):
+    hexagons = fs.layout.hexagonal(n_columns=6, n_rows=4, pitch_um=430.0)
+    return {"grid": camera, "hexagons": camera.replace(sensor=fs.Sensor(hexagons, read_noise_e=2.0))}
+
+
+def test_turned_cameras_are_compared(pair, sky):
+    options = {"exposure_s": 1e-3, "n_annuli": 2, "max_pixels": 32}
+    turned = {name: one.with_gaze(gaze_deg=GAZE_DEG) for name, one in pair.items()}
+    found = fs.compare.cameras(turned, {"sky": sky}, **options)
+    expected = fs.compare.cameras(pair, {"sky": sky.turned(gaze_deg=GAZE_DEG)}, **options)
+
+    for name, values in expected.values.items():
+        np.testing.assert_array_equal(found.values[name], values, err_msg=name)
+    assert found.settings["cameras"]["grid"]["gaze_deg"] == list(GAZE_DEG)
+    ahead = fs.compare.cameras(pair, {"sky": sky}, **options)
+    assert np.all(ahead.values["snr_mean_db"] != found.values["snr_mean_db"])
+
+
+def test_comparison_requires_one_direction(pair, sky):
+    flat = fs.Scene.flat(shape=(40, 40), pitch_um=100_000.0, distance_m=1.0, illuminance_lux=500.0)
+    turned = {name: one.with_gaze(gaze_deg=GAZE_DEG) for name, one in pair.items()}
+    with pytest.raises(ParameterError, match=r"'cameras' must have the same gaze_deg.* 'grid' and 'hexagons' differ"):
+        fs.compare.cameras(turned | {"grid": pair["grid"]}, {"sky": sky}, exposure_s=1e-3)
+    with pytest.raises(ParameterError, match=r"'gaze_deg' must be \(0, 0\) for a plane"):
+        fs.compare.cameras(turned, {"flat": flat}, exposure_s=1e-3)
+    moved = {name: one.with_gaze((100.0, 0.0), "sensor") for name, one in pair.items()}
+    with pytest.raises(ParameterError, match=r"'gaze_um' must be \(0, 0\) for panoramas.*'grid'.*'gaze_deg'"):
+        fs.compare.cameras(moved, {"sky": sky}, exposure_s=1e-3)
+
+
+@pytest.mark.parametrize("name", ["shift_sigma_um", "information_bit_per_site"])
+@pytest.mark.parametrize("gaze", [{"gaze_deg": GAZE_DEG}, {"gaze_um": (300.0, -200.0), "axis": "sensor"}])
+def test_metrics_of_turned_cameras(camera, sky, name, gaze):
+    away = camera.with_gaze(**gaze)
+    ahead_deg = away.seen_panorama(sky).gaze_deg
+    found, expected = (
+        number_of(name, ComparedShot(scene, one, 1e-3), one, one.capture(scene, exposure_s=1e-3, seed=0))
+        for one, scene in ((away, sky), (camera, sky.turned(gaze_deg=ahead_deg)))
+    )
+    assert found == pytest.approx(expected, rel=1e-6)
+    assert ahead_deg[0] > 5.0

@@ -18,6 +18,7 @@ from foveasim.camera._warnings import format_point, size_um
 from foveasim.distortion import Lens
 from foveasim.distortion._projected import directions_of
 from foveasim.errors import ParameterError
+from foveasim.fields import PowerMap
 from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.scene._panorama import Panorama
@@ -53,6 +54,24 @@ def different_part(one: Camera, other: Camera) -> str:
         if part_of_one is not part_of_other and to_plain_data(part_of_one) != to_plain_data(part_of_other):
             return part
     return ""
+
+
+def turned_instead(camera: Camera, light: Scene | PowerMap) -> tuple[Camera, Scene | PowerMap]:
+    """
+    Return a camera that looks ahead, and a panorama that is turned instead.
+
+    The camera then sees power maps of the panorama, and what :meth:`Camera.fit_scene` returns. Planes and power maps are
+    returned as they are; ParameterError is raised for a ``gaze_deg`` towards them.
+    """
+    if isinstance(light, Scene) and light.panorama is not None:
+        seen_deg = camera.seen_panorama(light).gaze_deg
+        ahead = (0.0, 0.0)
+        return camera.with_gaze(ahead if camera.axis == "sensor" else None, gaze_deg=ahead), light.turned(
+            gaze_deg=seen_deg
+        )
+    if any(camera.gaze_deg):
+        camera.light_at_gaze(light)  # raises the error
+    return camera, light
 
 
 def common_bounds_um(cameras: Sequence[Camera], fit: str, projection: ImageProjection = "rectilinear") -> Floats:

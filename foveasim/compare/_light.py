@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats
 from foveasim.camera import Camera
+from foveasim.camera._framing import turned_instead
 from foveasim.compare.annuli import Annuli
 from foveasim.fields import Grid, PowerMap
 from foveasim.reconstruct import reference
@@ -29,6 +30,12 @@ def with_angular_response(camera: Camera, light: Scene | PowerMap) -> Sensor:
     if camera.sensor.pixel_optics is None:
         return camera.sensor
     return camera.sensor.with_angular_response(camera.angular_response(light))
+
+
+def framed(camera: Camera, light: Scene | PowerMap) -> tuple[Camera, Scene | PowerMap]:
+    """Return a scene with its pitch, or a power map, and the camera for it."""
+    camera, light = turned_instead(camera, light)
+    return camera, camera.fit_scene(light) if isinstance(light, Scene) else light
 
 
 def image_of(camera: Camera, light: Scene | PowerMap, maps: dict[tuple[float, float], PowerMap]) -> PowerMap:

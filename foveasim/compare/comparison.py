@@ -17,7 +17,7 @@ from foveasim._core.extras import import_optional
 from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.validation import Floats, check_choice, check_number, check_point, read_only
 from foveasim.camera import Camera
-from foveasim.camera._framing import different_part
+from foveasim.camera._framing import different_part, turned_instead
 from foveasim.compare._light import (
     behind_image,
     e_per_photon,
@@ -320,7 +320,7 @@ def cameras(
     Parameters
     ----------
     cameras : mapping of str to Camera
-        Two or more, with the same optics and distortion.
+        Two or more, with the same optics, distortion and ``gaze_deg``.
     scenes : mapping of str to Scene or PowerMap, optional
         By default five photographs that fill the field (:func:`photograph_scenes`).
     exposure_s : float, s
@@ -352,7 +352,7 @@ def cameras(
     Raises
     ------
     ParameterError
-        When budgets differ, cameras have different lenses, or a value is out of range.
+        When budgets differ, cameras have different lenses or directions, or a value is out of range.
 
     Notes
     -----
@@ -394,10 +394,15 @@ def cameras(
     if not scenes:
         raise ParameterError("scenes", "must be a mapping of names to at least one scene", scenes)
     # All cameras have the same image, whose scale would otherwise follow from the layout of each.
-    lights = {
-        str(name): first.fit_scene(light, others=named.values()) if isinstance(light, Scene) else light
-        for name, light in scenes.items()
-    }
+    lights = {}
+    for name, scene in scenes.items():
+        if isinstance(scene, Scene) and scene.panorama is not None:
+            _check_directions(named)
+        ahead, light = turned_instead(first, scene)
+        lights[str(name)] = ahead.fit_scene(light, others=named.values()) if isinstance(light, Scene) else light
+    gaze_deg = first.gaze_deg  # of all cameras
+    named = {name: camera.with_gaze(gaze_deg=(0.0, 0.0)) for name, camera in named.items()}
+    first = next(iter(named.values()))
     steps = count(1)
 
     def advance() -> None:
@@ -485,6 +490,7 @@ def cameras(
                     "sensor": to_plain_data(camera.sensor, without={"layout"}),
                     "layout": to_plain_data(dict(camera.layout.provenance)),
                     "gaze_um": list(camera.gaze_um),
+                    "gaze_deg": list(gaze_deg),
                     "axis": camera.axis,
                 }
                 for name, camera in named.items()
@@ -572,9 +578,25 @@ def _check_cameras(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
         pair = f"{format_value(first_name)} and {format_value(name)}"
         if part := different_part(first, camera):
             raise ParameterError("cameras", f"must have the same {part}: those of {pair} differ")
+        if camera.gaze_deg != first.gaze_deg:
+            raise ParameterError(
+                "cameras", f"must have the same gaze_deg, since all see one image: those of {pair} differ"
+            )
         if camera.sensor.filter_names != first.sensor.filter_names:
             raise ParameterError("cameras", f"must have the same colour filters: those of {pair} differ")
     return named
+
+
+def _check_directions(cameras: Mapping[str, Camera]) -> None:
+    """Raise ParameterError for cameras that turn towards points in panoramas, framed once."""
+    for name, camera in cameras.items():
+        if camera.axis == "sensor" and any(camera.gaze_um):
+            raise ParameterError(
+                "gaze_um",
+                f"must be (0, 0) for panoramas and axis='sensor', but not that of {format_value(name)}; use 'gaze_deg'",
+                camera.gaze_um,
+                "µm",
+            )
 
 
 def _rate(frames_per_s: float | Mapping[str, float] | None, name: str, exposure_s: float) -> float:

@@ -19,6 +19,7 @@ from foveasim.compare._light import (
     behind_image,
     e_per_photon,
     field_of,
+    framed,
     image_of,
     mean_spectrum,
     photons_per_um2,
@@ -239,7 +240,7 @@ def information_by_annulus(
 )
 def shift_sigma_um(shot: MetricShot, camera: Camera, capture: Capture) -> float:
     """Return the Cramér-Rao bound for a shift of the known image, µm."""
-    light = camera.fit_scene(shot.scene) if isinstance(shot.scene, Scene) else shot.scene
+    camera, light = framed(camera, shot.scene)
     sensor, exposure_s = camera.sensor, shot.exposure_s
     model = sensor.linearise(capture.expected_e, exposure_s=exposure_s)
     gradient = _shift_gradients_e_per_um(behind_image(camera), image_of(camera, light, {}), exposure_s)
@@ -268,7 +269,7 @@ def alias_fraction(shot: MetricShot, camera: Camera, capture: Capture) -> float:
 
 def _information(shot: MetricShot, camera: Camera, capture: Capture) -> dict[str, Any]:
     """Return the information about scenes that have the covariance of the shot's scene."""
-    light = camera.fit_scene(shot.scene) if isinstance(shot.scene, Scene) else shot.scene
+    camera, light = framed(camera, shot.scene)
     annuli, _, grid = field_of([camera], (0.0, 0.0), 1, 16)
     image = image_of(camera.with_gaze((0.0, 0.0)), light, {})
     covariance = scene_covariance(photons_per_um2(image, grid, shot.exposure_s)[np.newaxis], grid.pitch_x_um)

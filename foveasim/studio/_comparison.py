@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from foveasim._core.validation import Floats
+from foveasim.camera import Camera
+from foveasim.camera._framing import turned_instead
 from foveasim.capture import Capture
 from foveasim.compare import budget_of, quality_by_eccentricity
 from foveasim.errors import FoveasimError, ParameterError
@@ -108,31 +110,40 @@ def _frame_rate(result: Simulated) -> float | None:
     return 1.0 / result.shot.exposure_s if result.shot.exposure_s > 0.0 else None
 
 
-def _framed_together(results: Sequence[Simulated]) -> list[tuple[Scene | PowerMap, Capture]]:
+class _Framed(NamedTuple):
+    """Scene of a variant, the camera for it, and the capture."""
+
+    camera: Camera
+    scene: Scene | PowerMap
+    capture: Capture
+
+
+def _framed_together(results: Sequence[Simulated]) -> list[_Framed]:
     """Return scene and capture of each variant, framed on all layouts with ``fit``."""
     shots = [result.shot for result in results]
     cameras = [shot.camera for shot in shots]
-    own = [(shot.scene, result.capture) for shot, result in zip(shots, results, strict=True)]
+    own = [_Framed(shot.camera, shot.scene, result.capture) for shot, result in zip(shots, results, strict=True)]
     fits = {shot.scene.fit if isinstance(shot.scene, Scene) and shot.scene.pitch_um is None else None for shot in shots}
     if len(fits) > 1 or fits == {None}:
         return own
-    found: list[tuple[Scene | PowerMap, Capture]] = []
+    found: list[_Framed] = []
     for shot, result in zip(shots, results, strict=True):
-        assert isinstance(shot.scene, Scene)
+        camera, scene = turned_instead(shot.camera, shot.scene)
+        assert isinstance(scene, Scene)
         try:
-            framed, alone = shot.camera.fit_scene(shot.scene, others=cameras), shot.camera.fit_scene(shot.scene)
+            framed, alone = camera.fit_scene(scene, others=cameras), camera.fit_scene(scene)
         except ParameterError:  # other lenses
             return own
         is_same = (framed.pitch_um, framed.axis_um) == (alone.pitch_um, alone.axis_um)
-        capture = shot.camera.capture
-        found.append(
-            (framed, result.capture if is_same else capture(framed, exposure_s=shot.exposure_s, seed=shot.seed))
-        )
+        capture = result.capture
+        if not is_same:
+            capture = camera.capture(framed, exposure_s=shot.exposure_s, seed=shot.seed)
+        found.append(_Framed(camera, framed, capture))
     return found
 
 
 def _measures(
-    result: Simulated, framed: tuple[Scene | PowerMap, Capture], rate_bit_per_s: float | None, half_um: float
+    result: Simulated, framed: _Framed, rate_bit_per_s: float | None, half_um: float
 ) -> dict[str, float | None]:
     budget = budget_of(result.shot.camera, 1.0)
     found: dict[str, float | None] = {
@@ -145,7 +156,7 @@ def _measures(
         "saturated_percent": 100.0 * result.capture.saturated_fraction,
         "read_noise_e": result.read_noise_e,
     }
-    (scene, capture), camera, centre_um = framed, result.shot.camera, fovea_um(result.capture.layout)
+    (camera, scene, capture), centre_um = framed, fovea_um(result.capture.layout)
     for name, side_um in (("field", half_um), ("fovea", FOVEA_FRACTION * half_um)):
         grid = _square(centre_um, side_um)
         try:
