@@ -18,6 +18,7 @@ import platform
 import sys
 import time
 import warnings
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,8 @@ mpl.use("agg")
 STAGES = {
     "diffraction": "Diffraction, defocus and aberrations",
 }
+#: Stages that need a library which other stages do without; left out where it is not installed.
+NEEDS = {"learning": "torch"}
 DIRECTORY = Path(__file__).parents[1] / "docs" / "validation"
 RESULTS = DIRECTORY / "results.json"
 console = Console(width=140)
@@ -65,7 +68,7 @@ def main() -> None:
     """Run the stages that the command line names, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="STAGE", help=f"one of {', '.join(STAGES)}; by default all")
-    chosen = parser.parse_args().names or list(STAGES)
+    chosen = parser.parse_args().names or [name for name in STAGES if find_spec(NEEDS.get(name, "numpy"))]
     if unknown := [name for name in chosen if name not in STAGES]:
         parser.error(f"unknown stages: {', '.join(unknown)}; possible: {', '.join(STAGES)}")
     DIRECTORY.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,161 @@
+"""Pages of the validation, from the results that ``make validate`` stores."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+    from sphinx.config import Config
+
+DIRECTORY = Path(__file__).parent / "validation"
+RESULTS = "results.json"
+OWN = "foveasim"
+INTRODUCTION = """\
+Every stage of foveasim, compared with closed forms and slow reference methods, and with other programs on the same input in the
+same run. A deviation is that from the truth, not from another program. Each comparison has a tolerance for foveasim, which
+`make validate` asserts; the other programs are not judged, and what they do differently is stated below each table."""
+READING = """\
+Times are the shortest of three calls, on {machine}. They include what a program does for its result and no imports; a program
+that computes more than the comparison asks for takes longer. Run all of it yourself with `make validate`, or a stage with
+`python validation/run.py STAGE`."""
+
+
+def pages_of(results: dict[str, Any]) -> dict[str, str]:
+    """Return the text of each page by its name."""
+    sections = results["sections"]
+    pages = {f"{section['name']}.md": page_of(section) for section in sections}
+    return {"index.md": index_of(sections, results["machine"]), **pages}
+
+
+def index_of(sections: list[dict[str, Any]], machine: dict[str, Any]) -> str:
+    """Return the overview: a row per stage."""
+    rows = [
+        "| stage | comparisons | largest part of a tolerance | compared with | time |",
+        "|---|---|---|---|---|",
+    ]
+    for section in sections:
+        programs = dict.fromkeys(
+            one["program"]
+            for row in section["rows"]
+            for one in row["results"]
+            if one["program"] != OWN
+        )
+        part = max(
+            own_of(row)["deviation"] / row["tolerance"] for row in section["rows"]
+        )
+        rows.append(
+            f"| [{section['title']}]({section['name']}.md) | {len(section['rows'])} | {100.0 * part:.2g} % | "
+            f"{', '.join(programs) or 'closed forms'} | {section['seconds']:.0f} s |"
+        )
+    n_rows = sum(len(section["rows"]) for section in sections)
+    kept = sum(
+        own_of(row)["deviation"] <= row["tolerance"]
+        for section in sections
+        for row in section["rows"]
+    )
+    named = "{processor} with {cores} cores, {system}, Python {python}, foveasim {foveasim}".format(
+        **machine
+    )
+    toctree = "\n".join(
+        [
+            "```{toctree}",
+            ":hidden:",
+            "",
+            *(section["name"] for section in sections),
+            "```",
+        ]
+    )
+    parts = [
+        "# Validation",
+        INTRODUCTION,
+        f"{kept} of {n_rows} comparisons are within their tolerances.",
+        "\n".join(rows),
+    ]
+    return "\n\n".join([*parts, READING.format(machine=named), toctree]) + "\n"
+
+
+def page_of(section: dict[str, Any]) -> str:
+    """Return the page of a stage: its table, figures, and explanations."""
+    rows = [
+        "| comparison | truth, source | program | deviation | tolerance | time |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in section["rows"]:
+        for k, one in enumerate(row["results"]):
+            first = (
+                [f"{row['what']}", f"{row['truth']}; {row['source']}"]
+                if k == 0
+                else ["", ""]
+            )
+            of = f" {row['of']}" if row["of"] else ""
+            bound = number(row["tolerance"]) if one["program"] == OWN else ""
+            took = "" if one["seconds"] is None else time_of(one["seconds"])
+            cells = [
+                *first,
+                one["program"],
+                f"{number(one['deviation'])}{of}",
+                bound,
+                took,
+            ]
+            rows.append(
+                f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+            )
+    figures = [
+        f"![{caption}]({name})\n\n{caption}"
+        for name, caption in section["figures"].items()
+    ]
+    differences = list(differences_of(section))
+    parts = [f"# {section['title']}", section["about"], "\n".join(rows), *figures]
+    if differences:
+        parts += ["## Differences", "\n".join(differences)]
+    return "\n\n".join(parts) + "\n"
+
+
+def differences_of(section: dict[str, Any]) -> Iterator[str]:
+    """Yield what explains deviations, and what other programs do not offer, as items of a list."""
+    for row in section["rows"]:
+        if row["explanation"]:
+            yield f"- {row['what']}: {row['explanation']}"
+    seen = set()
+    for row in section["rows"]:
+        for one in row["results"]:
+            if one["cannot"] and (one["program"], one["cannot"]) not in seen:
+                seen.add((one["program"], one["cannot"]))
+                yield f"- {one['program']}: {one['cannot']}."
+
+
+def own_of(row: dict[str, Any]) -> dict[str, Any]:
+    """Return the result of foveasim."""
+    return next(one for one in row["results"] if one["program"] == OWN)
+
+
+def number(value: float) -> str:
+    """Return a number with two digits."""
+    if value == 0.0 or 1e-2 <= abs(value) < 100.0:
+        return f"{value:.2g}"
+    if 100.0 <= abs(value) < 1e5:
+        return f"{value:.0f}"
+    mantissa, _, exponent = f"{value:.1e}".partition("e")
+    return f"{mantissa.removesuffix('.0')}e{int(exponent)}"
+
+
+def time_of(seconds: float) -> str:
+    """Return a time in the unit that suits it."""
+    for scale, unit in ((1.0, "s"), (1e-3, "ms")):
+        if seconds >= scale:
+            return f"{number(seconds / scale)} {unit}"
+    return f"{number(seconds / 1e-6)} µs"
+
+
+def write_validation(_app: Sphinx, _config: Config) -> None:
+    """Write the pages."""
+    for old in DIRECTORY.glob("*.md"):
+        old.unlink()
+    for name, text in pages_of(
+        json.loads((DIRECTORY / RESULTS).read_text("utf-8"))
+    ).items():
+        (DIRECTORY / name).write_text(text, "utf-8")
