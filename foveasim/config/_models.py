@@ -12,7 +12,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import lru_cache
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Union, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, create_model
 
@@ -62,7 +62,7 @@ _log = logging.getLogger("foveasim")
 class Section(BaseModel):
     """Base of all sections: unknown keys and other types are errors."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, protected_namespaces=())
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", strict=True, protected_namespaces=())
 
 
 def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **types: Any) -> type[Section]:

@@ -296,13 +296,14 @@ class TableCache:
         self._tables: dict[tuple[Hashable, Hashable], PlaneTables] = {}
         self._factors: dict[tuple[Hashable, bytes], NDArray[Any] | None] = {}
         #: Apertures, modes and relative illumination of the field, and images of scenes by their geometry.
-        self.apertures = BoundedCache(MAX_CACHED_APERTURES)
-        self.modes = BoundedCache(MAX_CACHED_APERTURES)
-        self.illumination = BoundedCache(MAX_CACHED_APERTURES)
-        self.views = BoundedCache(MAX_CACHED_VIEWS)
+        self.apertures: BoundedCache = BoundedCache(MAX_CACHED_APERTURES)
+        self.modes: BoundedCache = BoundedCache(MAX_CACHED_APERTURES)
+        self.illumination: BoundedCache = BoundedCache(MAX_CACHED_APERTURES)
+        self.views: BoundedCache = BoundedCache(MAX_CACHED_VIEWS)
         #: Of scenes with depth: tables of layers, layers, and lenses with a focus, each with its own cache.
-        self.radial = BoundedCache(MAX_CACHED_RADIAL)
-        self.layers, self.focused = BoundedCache(MAX_CACHED_LAYERS), BoundedCache(MAX_CACHED_LAYERS)
+        self.radial: BoundedCache = BoundedCache(MAX_CACHED_RADIAL)
+        self.layers: BoundedCache = BoundedCache(MAX_CACHED_LAYERS)
+        self.focused: BoundedCache = BoundedCache(MAX_CACHED_LAYERS)
 
     def __reduce__(self) -> tuple[type[TableCache], tuple[()]]:
         return TableCache, ()

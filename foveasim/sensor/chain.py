@@ -58,7 +58,7 @@ class _Arithmetic(_Deterministic):
     """Operation with an array (n_site,) or a number; a single neutral value changes nothing."""
 
     operation: ClassVar[np.ufunc]
-    neutral = 0.0
+    neutral: ClassVar[float] = 0.0
 
     def __init__(self, values: ArrayLike) -> None:
         self.values: NDArray[Any] = np.asarray(values)
@@ -77,19 +77,21 @@ class _Arithmetic(_Deterministic):
 class Factor(_Arithmetic):
     """Multiplication."""
 
-    operation, neutral = np.multiply, 1.0
+    operation: ClassVar[np.ufunc] = np.multiply
+    neutral: ClassVar[float] = 1.0
 
 
 class Offset(_Arithmetic):
     """Addition."""
 
-    operation = np.add
+    operation: ClassVar[np.ufunc] = np.add
 
 
 class FullWell(_Arithmetic):
     """Upper limit of the charge."""
 
-    operation, neutral = np.minimum, np.inf
+    operation: ClassVar[np.ufunc] = np.minimum
+    neutral: ClassVar[float] = np.inf
 
 
 @dataclass(eq=False)

@@ -194,8 +194,8 @@ class GazePath(_TimedPath):
     [[25.0, 12.5]]
     """
 
-    COLUMNS = ("t_s", "x_um", "y_um")
-    POINTS = "xy_um"
+    COLUMNS: ClassVar[tuple[str, str, str]] = ("t_s", "x_um", "y_um")
+    POINTS: ClassVar[str] = "xy_um"
 
     t_s: Floats
     xy_um: Floats
@@ -229,8 +229,8 @@ class DirectionPath(_TimedPath):
     [[45.0, 5.0]]
     """
 
-    COLUMNS = ("t_s", "azimuth_deg", "elevation_deg")
-    POINTS = "direction_deg"
+    COLUMNS: ClassVar[tuple[str, str, str]] = ("t_s", "azimuth_deg", "elevation_deg")
+    POINTS: ClassVar[str] = "direction_deg"
 
     t_s: Floats
     direction_deg: Floats

@@ -54,9 +54,9 @@ VERSION = "1.1.0"
 #: Number of rows decompressed at a time.
 BATCH = 4096
 #: Name of the unit in the reference system of the sensor plane.
-MICROMETRE = {"type": "LinearUnit", "name": "micrometre", "conversion_factor": 1e-6}
+MICROMETRE: dict[str, str | float] = {"type": "LinearUnit", "name": "micrometre", "conversion_factor": 1e-6}
 #: The sensor plane as a coordinate reference system (PROJJSON).
-SENSOR_PLANE = {
+SENSOR_PLANE: dict[str, Any] = {
     "$schema": "https://proj.org/schemas/v0.7/projjson.schema.json",
     "type": "EngineeringCRS",
     "name": "sensor plane",
