@@ -22,6 +22,9 @@ __all__ = ["ChainFit", "fit_chain"]
 
 #: Standard error of the nonlinearity up to which it is fitted, and its largest value.
 MAX_BEND_ERROR, MAX_BEND = 0.1, 0.3
+#: Charge over the full well above which levels of unknown light are full, and with which their fit starts. Largest full well
+#: over its first value.
+FULL, ABOVE, LARGEST = 0.95, 1.05, 1.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,15 +32,14 @@ class ChainFit:
     """
     Fit of the chain to levels.
 
-    ``levels``, ``exposures``, ``fixed_e``: of the levels that are used, ``is_used`` of all. ``start``: first values of the
-    first fit, from which its full well was left out: ``well_e``. ``dnl_dn``: of columns. ``bend``: why the nonlinearity is not
-    identifiable, if so.
+    ``levels``, ``exposures``: of the levels that are used, ``is_used`` of all. ``start``: first values of the first fit, from
+    which its full well was left out: ``well_e``. ``dnl_dn``: of columns. ``bend``: why the nonlinearity is not identifiable,
+    if so.
     """
 
     fit: PooledFit
     levels: Levels
     exposures: Exposures
-    fixed_e: Floats
     is_used: Bools
     start: Start
     well_e: float | None
@@ -79,19 +81,19 @@ def fit_chain(recording: Recording, defects: Defects, spread: Spread, before: Ch
     used = np.flatnonzero(is_used)
     dnl_dn2, dnl_error_dn2 = _variance_of(dnl_dn)
     levels = _selected(replace(levels, variances_dn2=levels.variances_dn2 - dnl_dn2), used)
-    exposures, fixed_e, light_e = _chosen(exposures, used), start.fixed_e[used], light_e[used]
+    exposures, light_e = _chosen(exposures, used), light_e[used]
     chain = Chain(recording.known, used.size, spread)
     if before is not None and well_e is not None and WELL not in names:
-        names[WELL] = _full_well(chain, levels, exposures, fixed_e, before, light_e)
+        names[WELL] = _full_well(chain, levels, exposures, before, light_e)
+        light_e[exposures.is_free & (light_e > FULL * names[WELL])] = ABOVE * names[WELL]
 
     def fit(names: Mapping[str, float]) -> PooledFit:
         return fit_levels(
-            chain, levels, exposures, names, light_e, fixed_e=fixed_e,
-            variance_error_dn2=errors[used], common_error_dn2=dnl_error_dn2,
-        )  # fmt: skip
+            chain, levels, exposures, names, light_e, variance_error_dn2=errors[used], common_error_dn2=dnl_error_dn2
+        )
 
     def result(found: PooledFit) -> ChainFit:
-        return ChainFit(found, levels, exposures, fixed_e, is_used, start, well_e, dnl_dn, bend)
+        return ChainFit(found, levels, exposures, is_used, start, well_e, dnl_dn, bend)
 
     found = fit(names)
     if BEND in names and (found.error(BEND) > MAX_BEND_ERROR or abs(found.values[BEND]) > MAX_BEND):
@@ -109,9 +111,7 @@ def _variance_of(dnl_dn: Estimate | Uncertain) -> tuple[float, float]:
     return dnl_dn.value**2, (dnl_dn.high**2 - dnl_dn.low**2) / (2.0 * HALF_WIDTH)
 
 
-def _full_well(
-    chain: Chain, levels: Levels, exposures: Exposures, fixed_e: Floats, before: ChainFit, start_e: Floats
-) -> float:
+def _full_well(chain: Chain, levels: Levels, exposures: Exposures, before: ChainFit, start_e: Floats) -> float:
     """Return the full well with the mean of the highest level, after a fit without it, e-."""
     from scipy.optimize import brentq
 
@@ -122,14 +122,15 @@ def _full_well(
     names, amounts = exposures.light_parameter, exposures.light
     rates = np.array([values.get(name, math.nan) for name in names])
     light_e = np.where(np.isnan(amounts * rates), start_e, amounts * rates)
-    light_e = np.where(np.isnan(fixed_e), light_e, fixed_e)
+    if exposures.is_free[highest]:
+        light_e[highest] = LARGEST * guess
     dark_e = values.get("dark_e_per_s", 0.0) * exposures.exposure_s
 
     def above(well_e: float) -> float:
         moments = chain.moments({**values, WELL: well_e}, light_e, dark_e)
         return float(moments.mean_dn[highest] - levels.mean_dn[highest])
 
-    low, high = 0.7 * guess, 1.4 * guess
+    low, high = 0.7 * guess, LARGEST * guess
     return float(brentq(above, low, high, rtol=1e-6)) if above(low) * above(high) < 0.0 else guess
 
 

@@ -145,7 +145,6 @@ def _responses(
         (light_e > 0.0)
         & (light_e < LINEAR_FRACTION * values.get("full_well_e", math.inf))
         & (chain.levels.mean_dn < LINEAR_FRACTION * (n_codes - 1))
-        & np.isnan(chain.fixed_e)
     )
     lines = {name: np.zeros(recording.n_classes) for name in ("row", "column")}
     response, response_noise = np.zeros(classes.shape), np.zeros(classes.shape)

@@ -102,7 +102,6 @@ def fit_levels(
     start: Mapping[str, float],
     start_e: Floats,
     *,
-    fixed_e: Floats,
     variance_error_dn2: Floats,
     common_error_dn2: float = 0.0,
 ) -> PooledFit:
@@ -110,14 +109,13 @@ def fit_levels(
     Return the parameters that explain the levels best.
 
     ``start``: first values of all parameters that are fitted. ``start_e`` (n_level,): first charges of levels of unknown light.
-    ``fixed_e`` (n_level,): charges of levels whose light cannot be determined, or NaN. ``variance_error_dn2`` (n_level,):
-    standard error of the variance of a level where it does not follow from the blocks, or NaN. ``common_error_dn2``: of
-    all variances together.
+    ``variance_error_dn2`` (n_level,): standard error of the variance of a level where it does not follow from the blocks, or
+    NaN. ``common_error_dn2``: of all variances together.
     """
-    model = _Model(chain, levels, exposures, tuple(start), start_e, fixed_e)
+    model = _Model(chain, levels, exposures, tuple(start), start_e)
     vector = model.pack(start)
     model.add_common_errors(vector, common_error_dn2)
-    damping = DAMPING
+    damping, n = DAMPING, len(model.names)
     moments = model.moments(vector)
     whiten = model.whitening(vector, moments)
     residual = whiten(model.residual(moments))
@@ -126,11 +124,17 @@ def fit_levels(
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
         diagonal = np.diag(normal).copy()
         diagonal[diagonal <= 0.0] = 1.0
+        # Logarithms of what the statistics do not determine, such as charges of full levels, move little.
+        diagonal[model.is_log] = np.maximum(diagonal[model.is_log], 1.0)
         before = float(residual @ residual)
         after = math.inf
         while damping < MAX_DAMPING:
             change = np.linalg.solve(normal + damping * np.diag(diagonal), gradient)
-            change *= min(1.0, MAX_CHANGE / max(float(np.abs(change[model.is_log]).max(initial=0.0)), 1e-300))
+            # A charge changes its own level only: that of a full one, which changes nothing, does not shorten other steps.
+            change[n:] = change[n:].clip(-MAX_CHANGE, MAX_CHANGE)
+            change[:n] *= min(
+                1.0, MAX_CHANGE / max(float(np.abs(change[:n][model.is_log[:n]]).max(initial=0.0)), 1e-300)
+            )
             proposed = model.moments(vector + change)
             new = model.residual(proposed)
             after = float((whiten(new) ** 2).sum()) if np.isfinite(new).all() else math.inf
@@ -156,11 +160,10 @@ class _Model:
     exposures: Exposures
     names: tuple[str, ...]
     start_e: Floats
-    fixed_e: Floats
 
     def __post_init__(self) -> None:
         self.common = np.zeros((2 * self.levels.mean_dn.size,) * 2)
-        self.free = np.flatnonzero(self.exposures.is_free & np.isnan(self.fixed_e))
+        self.free = np.flatnonzero(self.exposures.is_free)
         positive = [any(name.startswith(each) for each in POSITIVE) for name in self.names]
         self.is_log = np.array([*positive, *[True] * self.free.size])
 
@@ -214,8 +217,6 @@ class _Model:
             ]
         )
         light_e[self.free] = free_e
-        is_fixed = ~np.isnan(self.fixed_e)
-        light_e[is_fixed] = self.fixed_e[is_fixed]
         dark_e = values.get("dark_e_per_s", 0.0) * self.exposures.exposure_s
         if "dark_doubling_k" in values:
             reference_k = np.nanmin(self.exposures.temperature_k)

@@ -16,8 +16,8 @@ from foveasim.twin.fitting.recording import LINEAR_FRACTION
 
 __all__ = ["CLOSE_FRACTION", "Start", "first_values"]
 
-#: Fraction of the variance that shot noise would have, below which a level is close to the full well, and at which it is full.
-SATURATING, FULL = 0.6, 0.15
+#: Fraction of the variance that shot noise would have, below which pixels of a level are full.
+SATURATING = 0.6
 #: Fraction of the full well above which the first fit leaves out levels.
 CLOSE_FRACTION = 0.85
 #: Doubling temperature of the dark current, K.
@@ -29,13 +29,12 @@ class Start:
     """
     First values of a fit.
 
-    ``light_e``, ``fixed_e`` (n_level,): charges, and those of full levels of unknown light, or NaN. ``is_used``, ``is_close``:
-    levels below the highest codes, and those close to the full well.
+    ``light_e`` (n_level,): charges. ``is_used``, ``is_close``: levels below the highest codes, and those close to the full
+    well.
     """
 
     values: dict[str, float]
     light_e: Floats
-    fixed_e: Floats
     is_used: Bools
     is_close: Bools
 
@@ -72,12 +71,8 @@ def first_values(levels: Levels, exposures: Exposures, adc: ADC, *, has_dark_ser
         "read_noise_e2": max(noise / gain**2, 1e-3),
         "black_level_dn": black,
     }
-    fixed_e = np.full(levels.mean_dn.size, math.nan)
     if is_saturating.any():
         values["full_well_e"] = float(signal[is_saturating].max()) / gain
-        full = is_saturating & (relative < FULL) & exposures.is_free
-        well = values["full_well_e"]
-        fixed_e[full] = 1.5 * well + 10.0 * math.sqrt(well)
     is_used = ~is_clipped
     if not (is_used & is_dark).any():
         raise ParameterError("frames", "must contain dark frames below the highest code; check light and bits")
@@ -96,4 +91,4 @@ def first_values(levels: Levels, exposures: Exposures, adc: ADC, *, has_dark_ser
         values["nonlinearity_fraction"] = 0.0
     light_e = np.maximum(signal / gain, 1.0)
     is_close = ~is_dark & (light_e > CLOSE_FRACTION * values.get("full_well_e", math.inf))
-    return Start(values, light_e, fixed_e, is_used, is_close)
+    return Start(values, light_e, is_used, is_close)
