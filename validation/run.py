@@ -31,6 +31,7 @@ import foveasim as fs
 mpl.use("agg")
 #: Modules with a function ``validate(section, directory)``, in the order of the data flow, with their titles.
 STAGES = {
+    "radiometry": "Radiometry, photometry and colour",
     "diffraction": "Diffraction, defocus and aberrations",
 }
 #: Stages that need a library which other stages do without; left out where it is not installed.
