@@ -33,6 +33,7 @@ mpl.use("agg")
 STAGES = {
     "radiometry": "Radiometry, photometry and colour",
     "diffraction": "Diffraction, defocus and aberrations",
+    "image": "Images on photosites",
 }
 #: Stages that need a library which other stages do without; left out where it is not installed.
 NEEDS = {"learning": "torch"}
