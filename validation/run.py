@@ -34,6 +34,8 @@ STAGES = {
     "radiometry": "Radiometry, photometry and colour",
     "diffraction": "Diffraction, defocus and aberrations",
     "image": "Images on photosites",
+    "distortion": "Distortion, and fields beyond 90°",
+    "depth": "Depth and defocus",
 }
 #: Stages that need a library which other stages do without; left out where it is not installed.
 NEEDS = {"learning": "torch"}
