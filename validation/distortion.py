@@ -167,17 +167,18 @@ def compare_brown_conrady(section: Section, directory: Path) -> None:
             f"{opencv} undistortPoints": "stops after 5 iterations by default",
             f"{opencv} undistortPoints, 1000 iterations": "does not tell where the model has no inverse",
         },
-        explanation="The fixed point of OpenCV converges slowly towards the fold of the model, or diverges.",
+        explanation="The fixed point of OpenCV converges slowly towards the fold of the model.",
     )
     figure = Figure(figsize=(7.2, 2.8), layout="constrained")
     axes = figure.subplots()
-    angle = np.degrees(np.arctan(np.hypot(*ideal.T)))
-    order = np.argsort(angle)
-    for program, each in found.items():
-        axes.semilogy(angle[order], (np.hypot(*(each - ideal_px).T) + 1e-16)[order], ".", ms=1.5, label=program)
-    axes.set(xlabel="field angle / °", ylabel="deviation / pixels")
-    axes.legend(fontsize="small", markerscale=6)
-    section.draw("inverse", figure, "Deviations of ideal points, over the field.", directory)
+    ring = np.degrees(np.arctan(np.hypot(*ideal.T))).astype(int)
+    for (program, each), style in zip(found.items(), ("-", "-", "--"), strict=True):
+        largest = np.zeros(ring.max() + 1)
+        np.maximum.at(largest, ring, np.hypot(*(each - ideal_px).T))
+        axes.semilogy(np.arange(largest.size) + 0.5, largest + 1e-16, style, label=program)
+    axes.set(xlabel="field angle / °", ylabel="largest deviation / pixels")
+    axes.legend(fontsize="small")
+    section.draw("inverse", figure, "Largest deviations of ideal points in rings of 1° of the field.", directory)
 
 
 def compare_fisheye(section: Section) -> None:

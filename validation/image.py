@@ -176,8 +176,7 @@ def compare_waves(section: Section, directory: Path) -> None:
     )
     figure = Figure(figsize=(7.2, 2.8), layout="constrained")
     values, error = figure.subplots(1, 2)
-    order = np.argsort(ratio)
-    values.plot(ratio[order], np.abs(truth)[order], color="black", lw=2.5, alpha=0.3, label="truth")
+    values.plot(ratio, np.abs(truth), "o", color="black", ms=9.0, alpha=0.25, label="truth")
     for (program, each), marker in zip(found.items(), "o^sx", strict=False):
         values.plot(ratio, each, marker, ms=4.0, label=program)
         error.semilogy(ratio, np.abs(each - np.abs(truth)) + 1e-17, marker, ms=4.0, label=program)
