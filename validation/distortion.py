@@ -4,8 +4,8 @@ Points, directions and photosites of lens models, and light beyond 90°.
 Lens models of foveasim and OpenCV have the same formulas. The way from the scene to the sensor is a formula, whose rounding
 errors are compared with exact arithmetic. The way back has no closed form: foveasim uses Newton's method, and knows how far
 the model can be inverted; OpenCV iterates a fixed point for Brown and Conrady's model, 5 times if no criterion is given, and
-Newton's method for fisheye lenses. Beyond 90° there is no plane; foveasim has directions there, and integrates a panorama over
-the photosites, which OpenCV would resample.
+Newton's method for fisheye lenses. Beyond 90° there is no plane; foveasim has directions there, and integrates the image of a
+panorama over the photosites. With OpenCV one resamples the panorama, and sums the cells of labels that scikit-image fills.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import skimage.draw
 from matplotlib.figure import Figure
 from numpy.polynomial.legendre import leggauss
 from records import OWN, Section, largest_absolute, largest_relative
@@ -338,8 +339,8 @@ def compare_light(section: Section) -> None:
         step = 2.0 * np.radians(MAX_WIDE_DEG) / n_side
         labels = np.zeros((n_side, n_side), np.int32)
         for site, vertices in enumerate(np.split(layout.xy_um, layout.ring_offsets[1:-1]), 1):
-            corners = vertices / FOCAL_UM / step + 0.5 * n_side - 0.5
-            cv2.fillPoly(labels, [np.rint(256.0 * corners).astype(np.int32)], site, shift=8)
+            column, row = (vertices / FOCAL_UM / step + 0.5 * n_side - 0.5).T
+            labels[skimage.draw.polygon(row, column, labels.shape)] = site
         at = step * (np.arange(n_side) - 0.5 * n_side + 0.5)
         x, y = np.meshgrid(at, at)
         theta = np.hypot(x, y)
@@ -356,7 +357,7 @@ def compare_light(section: Section) -> None:
         sums = np.bincount(labels.ravel(), (image * over).ravel(), minlength=layout.n_sites + 1)
         return sums[1:] * step**2
 
-    opencv = f"OpenCV {cv2.__version__} remap and fillPoly"
+    opencv = f"OpenCV {cv2.__version__} remap, scikit-image {skimage.__version__} polygon"
     finer = f"{opencv}, 2048 x 2048 cells"
     section.compare(
         f"light of {layout.n_sites} photosites behind an equidistant lens, to {MAX_WIDE_DEG:.0f}°",

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.polynomial.legendre import leggauss
 from records import OWN, Section, largest, largest_absolute, largest_relative, version_of
 from scipy.interpolate import CubicSpline
 
@@ -33,6 +34,8 @@ FIELD_N, FIELD_TANGENT, N_FIELD = 1.4, 0.85, 201
 FAR_M = 1e6
 #: Pixels of the solid angles, and the tangent of the field at their outer edges.
 N_PIXELS, PIXELS_TANGENT = 20, 1.0
+#: Focal length of an equidistant lens, large compared with the PSF, and the largest angle of its photosites to the axis.
+WIDE_FOCAL_UM, WIDE_DEG = 20_000.0, 105.0
 BORN = "Born and Wolf, Principles of Optics (1999)"
 
 
@@ -108,6 +111,7 @@ def validate(section: Section, directory: Path) -> None:
     compare_photons(section)
     compare_colour(section)
     compare_solid_angles(section)
+    compare_wide_angles(section)
 
 
 def compare_irradiance(section: Section, directory: Path) -> None:
@@ -408,5 +412,57 @@ def compare_solid_angles(section: Section) -> None:
         tolerance=1e-4,
         deviation=largest,
         cannot={pyfai: "takes cos³ at the centre of a pixel; flat detectors only, thus fields below 180°"},
-        explanation="foveasim includes diffraction at f/1.4, which blurs light over the outer edges.",
+        explanation="foveasim includes diffraction, which moves light between pixels, in proportion to the f-number.",
     )
+
+
+def sector_light(layout: fs.Layout, tilt: str) -> np.ndarray:
+    """
+    Return the light of sites behind an equidistant lens from a uniform sphere, over radiance and pupil area, sr.
+
+    From the axis to the angle θ, a sector has 1 - cos θ per azimuth, or sin²θ/2 behind a flat pupil, constant beyond 90°. The
+    light of a site is the integral of this function over the azimuth, along its outline, by 24 Gauss nodes on each edge.
+    """
+    node, weight = leggauss(24)
+    found = np.zeros(layout.n_sites)
+    for site, a in enumerate(np.split(layout.xy_um / WIDE_FOCAL_UM, layout.ring_offsets[1:-1])):
+        along = (np.roll(a, -1, axis=0) - a)[:, np.newaxis]
+        at = a[:, np.newaxis] + (0.5 + 0.5 * node)[:, np.newaxis] * along
+        theta = np.hypot(at[..., 0], at[..., 1])
+        per_azimuth = 1.0 - np.cos(theta) if tilt == "turning" else 0.5 * np.sin(np.minimum(theta, 0.5 * np.pi)) ** 2
+        turn = (at[..., 0] * along[..., 1] - at[..., 1] * along[..., 0]) / theta**2
+        found[site] = (per_azimuth * turn * 0.5 * weight).sum()
+    return found
+
+
+def compare_wide_angles(section: Section) -> None:
+    """Light of sectors beyond 90° from a uniform sphere."""
+    radius_um = WIDE_FOCAL_UM * np.radians(WIDE_DEG)
+    layout = fs.layout.log_polar(n_sectors=48, r_min_um=0.15 * radius_um, r_max_um=radius_um)
+    per_w = 1e-9 * WAVELENGTH_NM / (PLANCK_J_S * LIGHT_M_S)
+
+    def own(tilt: str) -> np.ndarray:
+        optics = fs.Optics(
+            focal_length_mm=1e-3 * WIDE_FOCAL_UM,
+            f_number=FIELD_N,
+            lens="aplanatic",
+            projection="equidistant",
+            pupil_tilt=tilt,
+            precision="double",
+        )
+        lens = fs.distortion.Fisheye(projection="equidistant", focal_um=WIDE_FOCAL_UM)
+        camera = fs.Camera(optics=optics, sensor=fs.Sensor(layout, qe=1.0), distortion=lens, order=2)
+        pupil_m2 = math.pi * (0.5e-6 * WIDE_FOCAL_UM / FIELD_N) ** 2
+        return camera.photoelectrons_per_s(uniform_panorama()) / (per_w * pupil_m2)
+
+    for tilt, by in (("turning", "1 - cos θ"), ("flat", "sin²θ/2 up to 90°")):
+        section.compare(
+            f"light of {layout.n_sites} sectors from a uniform sphere, to {WIDE_DEG:g}°, {tilt} pupil",
+            {OWN: lambda tilt=tilt: own(tilt)},
+            sector_light(layout, tilt),
+            by=f"∮ ({by}) dφ along the outline",
+            source="solid angle of sectors, Green's theorem",
+            tolerance=1e-4,
+            deviation=largest,
+            explanation="The PSF at f/1.4 moves light between sectors. None of the other programs here has light beyond 90°.",
+        )
