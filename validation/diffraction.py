@@ -43,6 +43,11 @@ def airy(ratio: float = 0.0) -> np.ndarray:
     return ((outer - inner) / (1.0 - ratio**2)) ** 2
 
 
+def airy_at(radius_um: np.ndarray, lambda_n_um: float) -> np.ndarray:
+    """Return the PSF of a circular pupil at distances from its centre, relative to its peak."""
+    return (2.0 * jinc(np.pi * radius_um / lambda_n_um)) ** 2
+
+
 def jinc(v: np.ndarray) -> np.ndarray:
     """Return J1(v)/v."""
     return np.divide(j1(v), v, out=np.full_like(v, 0.5), where=v > 0.0)

@@ -31,7 +31,11 @@ import foveasim as fs
 mpl.use("agg")
 #: Modules with a function ``validate(section, directory)``, in the order of the data flow, with their titles.
 STAGES = {
+    "radiometry": "Radiometry, photometry and colour",
     "diffraction": "Diffraction, defocus and aberrations",
+    "image": "Images on photosites",
+    "distortion": "Distortion, and fields beyond 90°",
+    "depth": "Depth and defocus",
 }
 #: Stages that need a library which other stages do without; left out where it is not installed.
 NEEDS = {"learning": "torch"}
