@@ -33,6 +33,7 @@ mpl.use("agg")
 STAGES = {
     "diffraction": "Diffraction, defocus and aberrations",
     "integration": "Integration over photosites",
+    "electronics": "Electronics and noise",
 }
 #: Stages that need a library which other stages do without; left out where it is not installed.
 NEEDS = {"learning": "torch"}
