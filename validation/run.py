@@ -34,6 +34,7 @@ STAGES = {
     "diffraction": "Diffraction, defocus and aberrations",
     "integration": "Integration over photosites",
     "electronics": "Electronics and noise",
+    "resolution": "Resolution and picture quality",
 }
 #: Stages that need a library which other stages do without; left out where it is not installed.
 NEEDS = {"learning": "torch"}
