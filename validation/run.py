@@ -33,6 +33,7 @@ mpl.use("agg")
 STAGES = {
     "diffraction": "Diffraction, defocus and aberrations",
     "integration": "Integration over photosites",
+    "angular": "Oblique light",
     "electronics": "Electronics and noise",
     "resolution": "Resolution and picture quality",
 }
