@@ -36,6 +36,7 @@ STAGES = {
     "angular": "Oblique light",
     "electronics": "Electronics and noise",
     "resolution": "Resolution and picture quality",
+    "timing": "Rolling shutters, events and spikes",
 }
 #: Stages that need a library which other stages do without; left out where it is not installed.
 NEEDS = {"learning": "torch"}
