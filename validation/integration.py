@@ -225,7 +225,7 @@ def validate(section: Section, directory: Path) -> None:
             source=GEOS,
             tolerance=1e-12,
             cannot={
-                extract: "no compiled operator: overlaps are found for each map",
+                extract: "overlaps are found again for each map; users can store its coverage fractions as a matrix",
                 CENTRES: "no parts of cells; the time is without drawing labels",
             },
             explanation="Labels err by the cells that a border cuts. exactextract keeps parts of cells in single precision.",
@@ -316,6 +316,8 @@ def draw_orders(section: Section, directory: Path, found: dict[str, np.ndarray])
     sizes_um = found["sizes_um"]
     for (name, values), style in zip(list(found.items())[1:], ("o-", "s-", "x--", "^-"), strict=True):
         axes.loglog(sizes_um, values, style, label=name)
+    axes.set_xticks(sizes_um, [f"{each:g}" for each in sizes_um])
+    axes.set_xticks([], minor=True)
     axes.set(xlabel="cell / µm", ylabel="largest relative error")
     axes.legend(fontsize="small")
     section.draw(
