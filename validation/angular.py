@@ -3,8 +3,8 @@ Response of pixels to oblique cones of light: openings above photodiodes, and mi
 
 Rays are geometric. The light that passes an opening and reaches the photodiode below is the overlap of two displaced polygons,
 averaged over the cone; a microlens images the pupil onto the photodiode. foveasim uses few rays where displacements are small,
-and promises responses within 1e-3 of the mean over the cone (2e-3 at f/2 and 4e-3 at f/1.4 for microlenses). No other installed
-program has pixels under cones of light; compared are 100,000 random rays by NumPy, and the shadow of the chief ray alone, a
+and promises responses within 1e-3 of the mean over the cone (2e-3 at f/2 and 4e-3 at f/1.4 for microlenses). None of the other
+programs has pixels under cones of light; compared are 100,000 random rays by NumPy, and the shadow of the chief ray alone, a
 common approximation.
 """
 

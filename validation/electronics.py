@@ -475,6 +475,9 @@ def compare_emva(section: Section) -> None:
             of=ERRORS,
             deviation=in_errors(errors[name]),
             repeats=0,
+            explanation="emva1288 divides the DSNU in DN by the gain of all levels, foveasim here by that of every seventh."
+            if name == "dsnu"
+            else "",
             cannot={
                 program: "its search for saturation stops at a peak of the noise; given the level of highest variance"
             }

@@ -2,7 +2,7 @@
 Rolling shutters, event pixels and spiking pixels.
 
 Light changes linearly between frames here, or exponentially, so that exposures and threshold crossings have closed forms.
-Random events are compared in standard errors of their expected scatter. No other installed program has rolling shutters,
+Random events are compared in standard errors of their expected scatter. None of the other programs has rolling shutters,
 event pixels or spiking pixels; where a distribution is elementary, NumPy draws from it, too.
 """
 
