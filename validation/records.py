@@ -134,7 +134,7 @@ class Section:
         of : str, optional
             Unit of the deviation; by default that of the function.
         cannot : mapping of str to str, optional
-            What programs do not offer, or do differently, by their names.
+            What programs do not offer, or do differently, by their names; of programs without a call, it joins the explanation.
         explanation : str
             Why programs differ, or that the reason is open.
         repeats : int
@@ -159,6 +159,8 @@ class Section:
             for program, each in found.items()
         )
         shown = OF[deviation] if of is None else of
+        absent = [f"{program}: {text}." for program, text in (cannot or {}).items() if program not in calls]
+        explanation = " ".join([explanation, *absent]).strip()
         self.rows.append(Row(what, by, source, shown, tolerance, results, explanation))
         return found
 

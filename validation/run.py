@@ -36,6 +36,11 @@ STAGES = {
     "image": "Images on photosites",
     "distortion": "Distortion, and fields beyond 90°",
     "depth": "Depth and defocus",
+    "integration": "Integration over photosites",
+    "angular": "Oblique light",
+    "electronics": "Electronics and noise",
+    "resolution": "Resolution and picture quality",
+    "timing": "Rolling shutters, events and spikes",
 }
 #: Stages that need a library which other stages do without; left out where it is not installed.
 NEEDS = {"learning": "torch"}

@@ -217,7 +217,8 @@ def change_events(
                         )
                     u = at + refractory_s
                 if tau > 0.0:
-                    memory[i, LEVEL] = log_level + part_change - slope * tau + swing * math.exp(-part_s / tau)
+                    # As a rise: in a frame much shorter than tau, slope * tau is much larger than the level.
+                    memory[i, LEVEL] += _rise(slope, swing, tau, 0.0, part_s)
         ends[k] = n
     return n
 

@@ -101,6 +101,17 @@ def test_low_pass_is_faster_at_higher_current(polarity):
         assert np.allclose(np.diff(late), tau_s[site] * steps, rtol=1e-9)
 
 
+@pytest.mark.parametrize("rise_s", [1e-10, 1e-12, 1e-14])
+def test_low_pass_resolves_times_after_fast_steps(rise_s):
+    capacitance_f, light, contrast, step = 2e-14, 2e5, 0.25, 2.0
+    tau_s = capacitance_f * BOLTZMANN_J_PER_K * 300.0 / (ELEMENTARY_CHARGE_C**2 * light)
+    pixels = pixels_of(contrast_on=contrast, capacitance_f=capacitance_f)
+    events = pixels.events([[math.exp(-step) * light], [light], [light]], times_s=[0.0, rise_s, 1.0], seed=0)
+
+    expected_s = -tau_s * np.log(1.0 - contrast * np.arange(1, 8) / step)
+    np.testing.assert_allclose(events.t_s[:7], expected_s, rtol=1e-7)
+
+
 def test_change_faster_than_low_pass_is_undetected():
     pixels = pixels_of(capacitance_f=2e-14)
 
