@@ -32,6 +32,7 @@ mpl.use("agg")
 #: Modules with a function ``validate(section, directory)``, in the order of the data flow, with their titles.
 STAGES = {
     "diffraction": "Diffraction, defocus and aberrations",
+    "layouts": "Layouts, design rules and files",
 }
 #: Stages that need a library which other stages do without; left out where it is not installed.
 NEEDS = {"learning": "torch"}
