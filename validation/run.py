@@ -33,6 +33,7 @@ mpl.use("agg")
 STAGES = {
     "diffraction": "Diffraction, defocus and aberrations",
     "layouts": "Layouts, design rules and files",
+    "published": "Published measurements and claims",
 }
 #: Stages that need a library which other stages do without; left out where it is not installed.
 NEEDS = {"learning": "torch"}
