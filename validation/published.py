@@ -457,8 +457,8 @@ def compare_pixirad(section: Section) -> None:
         return aperture * math.exp(-2.0 * (math.pi * 1e-3 * per_mm * spread_um[angle_deg]) ** 2)
 
     fitted = (
-        "The widths of the cloud, 20.2 µm along and 23.2 µm across, are fitted to this modulation and the next. They are rounded "
-        "to 0.1 µm, which changes it by up to 0.002."
+        "The widths of the cloud, 20.2 µm along and 23.2 µm across, are fitted to this modulation and the next. Their rounding "
+        "to 0.1 µm changes it by up to 0.001."
     )
     predicted = (
         "This frequency and the next are predicted from the widths; the tolerance is for a cloud that is no Gaussian. The MTF "
@@ -474,7 +474,7 @@ def compare_pixirad(section: Section) -> None:
             printed,
             lambda f=per_mm, a=angle_deg: mtf(f, a),
             source,
-            tolerance=4.0,
+            tolerance=3.0,
             explanation=fitted if angle_deg == 0.0 else "",
         )
     for what, angle_deg, printed in (("along the apothem", 0.0, "13.3"), ("across", 90.0, "12.0")):
