@@ -44,8 +44,10 @@ def index_of(sections: list[dict[str, Any]], machine: dict[str, Any]) -> str:
             for one in row["results"]
             if one["program"] != OWN
         )
+        # Counts without a tolerance have no part of it.
         part = max(
-            own_of(row)["deviation"] / row["tolerance"] for row in section["rows"]
+            own_of(row)["deviation"] / (row["tolerance"] or 1.0)
+            for row in section["rows"]
         )
         rows.append(
             f"| [{section['title']}]({section['name']}.md) | {len(section['rows'])} | {100.0 * part:.2g} % | "

@@ -41,6 +41,9 @@ STAGES = {
     "electronics": "Electronics and noise",
     "resolution": "Resolution and picture quality",
     "timing": "Rolling shutters, events and spikes",
+    "layouts": "Layouts, design rules and files",
+    "published": "Published measurements and claims",
+    "learning": "Gradients, adjoints and noise in PyTorch",
 }
 #: Stages that need a library which other stages do without; left out where it is not installed.
 NEEDS = {"learning": "torch"}
@@ -80,6 +83,8 @@ def main() -> None:
     chosen = parser.parse_args().names or [name for name in STAGES if find_spec(NEEDS.get(name, "numpy"))]
     if unknown := [name for name in chosen if name not in STAGES]:
         parser.error(f"unknown stages: {', '.join(unknown)}; possible: {', '.join(STAGES)}")
+    if absent := [f"{name} needs {NEEDS[name]}" for name in chosen if name in NEEDS and not find_spec(NEEDS[name])]:
+        parser.error(", ".join(absent))
     DIRECTORY.mkdir(parents=True, exist_ok=True)
     sections = read_sections()
     missed = []
