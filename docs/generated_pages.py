@@ -6,7 +6,6 @@ import ast
 import importlib
 import inspect
 import io
-import json
 import pkgutil
 import re
 import runpy
@@ -205,13 +204,12 @@ def generated_pages(repository: Path) -> set[Path]:
         Path("results/home", picture) for picture in ("gaze.webp", "gaze_still.png")
     }
     reference = {Path("reference", page) for page in {"index.md"} | modules | made}
-    stored = json.loads((repository / "docs/validation/results.json").read_text())
-    stages = {"index", *(section["name"] for section in stored["sections"])}
+    validation = {path.stem for path in (repository / "validation").glob("*.py")}
     return (
         layouts
         | home
         | reference
-        | {Path("validation", f"{stage}.md") for stage in stages}
+        | {Path("validation", f"{stage}.md") for stage in {"index", *validation}}
         | {Path("gallery", page) for page in {"index.md"} | scripts}
     )
 

@@ -38,12 +38,12 @@ def index_of(sections: list[dict[str, Any]], machine: dict[str, Any]) -> str:
         "|---|---|---|---|---|",
     ]
     for section in sections:
-        programs = dict.fromkeys(
-            one["program"]
+        names = [
+            one["program"].partition(",")[0]
             for row in section["rows"]
             for one in row["results"]
-            if one["program"] != OWN
-        )
+        ]
+        programs = dict.fromkeys(name for name in names if OWN not in name)
         # Counts without a tolerance have no part of it.
         part = max(
             own_of(row)["deviation"] / (row["tolerance"] or 1.0)

@@ -334,10 +334,11 @@ def test_cached_properties_have_no_lock():
     assert using == {"_core/calls/pickling.py"}  # recognises both
 
 
-def test_names_imported_by_benchmarks_exist():
+@pytest.mark.parametrize("folder", ["benchmarks", "validation"])
+def test_names_imported_by_programs_exist(folder):
     missing = [
         f"{path.name}: {node.module}.{item.name}"
-        for path in sorted((PACKAGE.parent / "benchmarks").glob("*.py"))
+        for path in sorted((PACKAGE.parent / folder).glob("*.py"))
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == PACKAGE.name
         if not node.module.startswith("foveasim.learn")  # requires PyTorch

@@ -44,6 +44,7 @@ FOLDERS = {
     "tests/interop": {"interop"},
     "benchmarks": {"dev", "learn", "peers"},
     "gallery": {"dev", "learn"},
+    "validation": {"adapters", "learn", "validate"},
     "docs": {"docs", "learn"},
 }
 #: What may name PyTorch: the only tests that run where it is installed, and the check whether it is.

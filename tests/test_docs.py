@@ -25,7 +25,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 #: Targets of links and pictures, without URLs and sections of the same page.
 TARGET = re.compile(r"\]\((?![a-z]+:)([^)#\s]+)")
 #: Directories that the build writes.
-GENERATED = {"_build", "gallery", "layouts", "reference", "results"}
+GENERATED = {"_build", "gallery", "layouts", "reference", "results", "validation"}
 
 
 def pages_of(root):

@@ -29,6 +29,7 @@ from rich.console import Console
 import foveasim as fs
 
 mpl.use("agg")
+mpl.rcParams["svg.hashsalt"] = "foveasim"  # equal figures have equal files
 #: Modules with a function ``validate(section, directory)``, in the order of the data flow, with their titles.
 STAGES = {
     "radiometry": "Radiometry, photometry and colour",
