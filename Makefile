@@ -28,7 +28,7 @@ CHECK_PYTHON = command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found; s
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	{ echo "foveasim requires Python 3.11 or later; specify one with: make PYTHON=python3.12"; exit 1; }
 
-.PHONY: demo test test-all test-nightly test-pages test-core test-lowest test-torch test-interop soak lint lint-js bench bench-torch validate peers docs clean
+.PHONY: demo test test-all test-nightly test-pages test-core test-lowest test-torch test-interop soak lint lint-js bench bench-torch validate release-check peers docs clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.installed
@@ -107,6 +107,10 @@ validate: $(VENV)/.installed-validate $(TORCH_VENV)/.installed
 	$(BIN)/python validation/run.py
 	$(TORCH_VENV)/bin/python validation/run.py learning
 
+# What is built, installed and documented, before a release.
+release-check: $(VENV)/.installed-release
+	$(BIN)/python release/check.py
+
 # The same work with other libraries.
 peers: $(VENV)/.installed-dev
 	$(BIN)/python $(INSTALL) --editable '.[peers]'
@@ -142,6 +146,11 @@ $(VENV)/.installed-validate: $(VENV)/.made pyproject.toml
 	@echo "installing foveasim and the programs of its validation into $(VENV) (minutes)"
 	$(BIN)/python $(INSTALL) --editable '.[validate]'
 	touch $@ $(VENV)/.installed-dev $(VENV)/.installed
+
+$(VENV)/.installed-release: $(VENV)/.made pyproject.toml
+	@echo "installing foveasim and the programs of its release into $(VENV) (a minute or so)"
+	$(BIN)/python $(INSTALL) --editable '.[release]'
+	touch $@ $(VENV)/.installed-docs $(VENV)/.installed-dev $(VENV)/.installed
 
 $(VENV)/.installed-docs: $(VENV)/.made pyproject.toml
 	@echo "installing foveasim and its documentation tools into $(VENV) (a minute or so)"

@@ -45,6 +45,7 @@ FOLDERS = {
     "benchmarks": {"dev", "learn", "peers"},
     "gallery": {"dev", "learn"},
     "validation": {"adapters", "learn", "validate"},
+    "release": {"release"},
     "docs": {"docs", "learn"},
 }
 #: What may name PyTorch: the only tests that run where it is installed, and the check whether it is.

@@ -1,0 +1,189 @@
+"""
+Checks before a release: what is built and documented is what the repository says. Needs the extra ``release``.
+
+    python release/check.py                     all checks
+    python release/check.py build types api     some of them
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+#: Largest size of the wheel, 10^6 bytes.
+MAX_WHEEL_MB = 4.0
+#: Smallest part of the public symbols whose types pyright knows.
+MIN_TYPED = 0.99
+
+
+class CheckError(Exception):
+    """A release check that fails."""
+
+
+@dataclass
+class Context:
+    """Temporary directory, with the wheel and the source distribution once they are built."""
+
+    directory: Path
+
+    @property
+    def wheel(self) -> Path:
+        """The wheel, built from the repository."""
+        found = sorted((self.directory / "dist").glob("*.whl"))
+        if not found:
+            run(sys.executable, "-m", "build", "--outdir", str(self.directory / "dist"), str(ROOT))
+            found = sorted((self.directory / "dist").glob("*.whl"))
+        return found[0]
+
+    @property
+    def sdist(self) -> Path:
+        """The source distribution, from which the wheel is built."""
+        return self.wheel.with_name(f"foveasim-{self.version}.tar.gz")
+
+    @property
+    def version(self) -> str:
+        """Version of the wheel."""
+        return self.wheel.name.split("-")[1]
+
+
+def run(*command: str, cwd: Path | None = None, **variables: str) -> str:
+    """Run a program and return what it prints; raise CheckError with its last lines if it fails."""
+    found = subprocess.run(
+        command, cwd=cwd, env={**os.environ, **variables}, capture_output=True, text=True, check=False
+    )
+    if found.returncode:
+        last = "\n".join((found.stdout + found.stderr).splitlines()[-20:])
+        raise CheckError(f"{' '.join(command[:4])} ... failed:\n{last}")
+    return found.stdout
+
+
+def members(wheel: Path) -> dict[str, str]:
+    """Return the hash of each file of a wheel, but for the list of hashes."""
+    with zipfile.ZipFile(wheel) as archive:
+        names = [name for name in archive.namelist() if not name.endswith("/RECORD")]
+        return {name: hashlib.sha256(archive.read(name)).hexdigest() for name in names}
+
+
+def check_build(context: Context) -> str:
+    """Build the source distribution and the wheel from it; a wheel from the repository is the same."""
+    direct = context.directory / "direct"
+    run(sys.executable, "-m", "build", "--wheel", "--outdir", str(direct), str(ROOT))
+    one, other = members(context.wheel), members(next(direct.glob("*.whl")))
+    if different := sorted(name for name in one.keys() | other.keys() if one.get(name) != other.get(name)):
+        raise CheckError(f"wheels from the repository and from the source distribution differ: {different[:5]}")
+    with tarfile.open(context.sdist) as archive:
+        tracked = set(run("git", "ls-files", cwd=ROOT).splitlines())
+        names = {name.partition("/")[2] for name in archive.getnames()}
+        if missing := sorted(name for name in tracked if name.startswith("foveasim/") and name not in names):
+            raise CheckError(f"files are missing in the source distribution: {missing[:5]}")
+    run(sys.executable, "-m", "twine", "check", "--strict", str(context.wheel), str(context.sdist))
+    size_mb = context.wheel.stat().st_size / 1e6
+    if size_mb > MAX_WHEEL_MB:
+        raise CheckError(f"the wheel has {size_mb:.2f} MB, at most {MAX_WHEEL_MB:g}")
+    sdist_mb = context.sdist.stat().st_size / 1e6
+    return f"wheel of {size_mb:.2f} MB with {len(one)} files, source distribution of {sdist_mb:.1f} MB"
+
+
+def check_version(context: Context) -> str:
+    """Compare the version of the wheel with that of the citation and the changelog."""
+    citation = (ROOT / "CITATION.cff").read_text("utf-8")
+    cited = re.search(r"^version: *['\"]?([^'\"\n]+)", citation, re.MULTILINE)
+    if cited is None or cited.group(1) != context.version:
+        raise CheckError(f"CITATION.cff has the version {cited and cited.group(1)}, the wheel {context.version}")
+    changelog = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    released = f"## [{context.version}]" in changelog
+    if not released and f"will be {context.version}" not in changelog:
+        raise CheckError(
+            f"CHANGELOG.md must have a section of {context.version}, or state that it will be the next release"
+        )
+    return f"{context.version}, {'released' if released else 'not yet released in the changelog'}"
+
+
+def check_api(_context: Context) -> str:
+    """Compare the public interface with the stored one."""
+    return run(sys.executable, str(ROOT / "release" / "api.py")).strip()
+
+
+def check_types(context: Context) -> str:
+    """Measure which part of the public types pyright knows, in an environment without extras."""
+    python = environment(context, "")
+    directory = context.directory / "empty"
+    directory.mkdir(exist_ok=True)
+    path = f"{python.parent}{os.pathsep}{os.environ['PATH']}"
+    found = subprocess.run(
+        [sys.executable, "-m", "pyright", "--verifytypes", "foveasim", "--ignoreexternal", "--outputjson"],
+        cwd=directory, env={**os.environ, "PATH": path, "VIRTUAL_ENV": str(python.parents[1])}, capture_output=True,
+        text=True, check=False,
+    )  # fmt: skip
+    report = json.loads(found.stdout)["typeCompleteness"]
+    counts, score = report["exportedSymbolCounts"], report["completenessScore"]
+    if not counts["withKnownType"] or score < MIN_TYPED:
+        names = [each["name"] for each in report["symbols"] if each["isExported"] and not each["isTypeKnown"]]
+        raise CheckError(
+            f"{100.0 * score:.1f} % of the public types are known, at least {100.0 * MIN_TYPED:g}: {names[:9]}"
+        )
+    return f"{100.0 * score:.2f} % of {sum(counts.values()):,} public symbols have known types"
+
+
+def environment(context: Context, extra: str) -> Path:
+    """Return the interpreter of a new environment with the wheel and an extra, or with none."""
+    directory = context.directory / f"env-{extra or 'core'}"
+    python = directory / "bin" / "python"
+    if not python.exists():
+        run(sys.executable, "-m", "venv", str(directory))
+        wheel = f"{context.wheel}[{extra}]" if extra else str(context.wheel)
+        run(str(python), "-m", "pip", "install", "--quiet", "--no-compile", wheel)
+    return python
+
+
+def check_docs(_context: Context) -> str:
+    """Build the documentation, with warnings as errors, and check its links."""
+    return run("make", "docs", cwd=ROOT).strip().splitlines()[-1]
+
+
+CHECKS: dict[str, Callable[[Context], str]] = {
+    "build": check_build,
+    "version": check_version,
+    "api": check_api,
+    "types": check_types,
+    "docs": check_docs,
+}
+
+
+def main() -> None:
+    """Run the checks that the command line names, or all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="CHECK", help=f"one of {', '.join(CHECKS)}; by default all")
+    chosen = parser.parse_args().names or list(CHECKS)
+    if unknown := [name for name in chosen if name not in CHECKS]:
+        parser.error(f"unknown checks: {', '.join(unknown)}; possible: {', '.join(CHECKS)}")
+    failed = []
+    with tempfile.TemporaryDirectory() as directory:
+        context = Context(Path(directory))
+        for name in chosen:
+            start_s = time.perf_counter()
+            try:
+                verdict = CHECKS[name](context)
+            except CheckError as error:
+                failed.append(name)
+                verdict = f"FAILED: {error}"
+            print(f"{name} ({time.perf_counter() - start_s:.0f} s): {verdict}", flush=True)
+    if failed:
+        sys.exit(f"failed: {', '.join(failed)}")
+
+
+if __name__ == "__main__":
+    main()
