@@ -160,6 +160,26 @@ def test_unknown_light_is_enough_for_the_gain():
     assert found.estimates["read_noise_e"].value == pytest.approx(4.0, rel=0.02)
 
 
+def test_levels_of_unknown_light_may_be_full():
+    """One level is barely above the full well: a tenth of its pixels are not full."""
+    rng = np.random.default_rng(2)
+    response = 1.0 + 0.02 * rng.standard_normal((N_Y, N_X))
+
+    def frames(signal_e, n=24):
+        charge = np.minimum(rng.poisson(signal_e * response, (n, N_Y, N_X)), 8000)
+        return np.rint(0.4 * (charge + rng.normal(0.0, 5.0, charge.shape)) + 60.0).astype(np.uint16)
+
+    fractions = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.03, 1.15, 1.3)
+    stacks = [fs.twin.Stack(frames(0.0, 48), 1e-3, light=0)]
+    stacks += [fs.twin.Stack(frames(8000.0 * fraction), 1e-3) for fraction in fractions]
+    found = fs.twin.fit(stacks, bits=12, pixel_um=3.0)
+
+    assert found.chi_square_ratio < 3.0
+    for name, value in (("gain_dn_per_e", 0.4), ("read_noise_e", 5.0), ("full_well_e", 8000.0)):
+        each = found.estimates[name]
+        assert abs(each.value - value) < each.high - each.low, name
+
+
 def test_photons_give_the_quantum_efficiency():
     known = numpy_stacks(0.4, 4.0, 60.0, 8000.0)
     charges = 1.2 * 8000.0 * TIMES_S / TIMES_S[-1]
