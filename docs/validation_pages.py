@@ -19,19 +19,20 @@ Every stage of foveasim, compared with closed forms and slow reference methods, 
 same run. A deviation is that from the truth, not from another program. Each comparison has a tolerance for foveasim, which
 `make validate` asserts; the other programs are not judged, and what they do differently is stated below each table."""
 READING = """\
-Times are the shortest of three calls, on {machine}. They include what a program does for its result and no imports; a program
-that computes more than the comparison asks for takes longer. Run all of it yourself with `make validate`, or a stage with
-`python validation/run.py STAGE`."""
+Times are the shortest of up to three calls, on the machine that each page names. They include what a program does for its
+result and no imports; a program that computes more than the comparison asks for takes longer. Run all of it yourself with
+`make validate`, or a stage with `python validation/run.py STAGE`."""
+MACHINE = "Times: {processor} with {cores} cores, {system}, Python {python}, foveasim {foveasim}."
 
 
 def pages_of(results: dict[str, Any]) -> dict[str, str]:
     """Return the text of each page by its name."""
     sections = results["sections"]
     pages = {f"{section['name']}.md": page_of(section) for section in sections}
-    return {"index.md": index_of(sections, results["machine"]), **pages}
+    return {"index.md": index_of(sections), **pages}
 
 
-def index_of(sections: list[dict[str, Any]], machine: dict[str, Any]) -> str:
+def index_of(sections: list[dict[str, Any]]) -> str:
     """Return the overview: a row per stage."""
     rows = [
         "| stage | comparisons | largest part of a tolerance | compared with | time |",
@@ -50,7 +51,7 @@ def index_of(sections: list[dict[str, Any]], machine: dict[str, Any]) -> str:
             for row in section["rows"]
         )
         rows.append(
-            f"| [{section['title']}]({section['name']}.md) | {len(section['rows'])} | {100.0 * part:.2g} % | "
+            f"| [{section['title']}]({section['name']}.md) | {len(section['rows'])} | {number(100.0 * part)} % | "
             f"{', '.join(programs) or 'closed forms'} | {section['seconds']:.0f} s |"
         )
     n_rows = sum(len(section["rows"]) for section in sections)
@@ -58,9 +59,6 @@ def index_of(sections: list[dict[str, Any]], machine: dict[str, Any]) -> str:
         own_of(row)["deviation"] <= row["tolerance"]
         for section in sections
         for row in section["rows"]
-    )
-    named = "{processor} with {cores} cores, {system}, Python {python}, foveasim {foveasim}".format(
-        **machine
     )
     toctree = "\n".join(
         [
@@ -77,7 +75,7 @@ def index_of(sections: list[dict[str, Any]], machine: dict[str, Any]) -> str:
         f"{kept} of {n_rows} comparisons are within their tolerances.",
         "\n".join(rows),
     ]
-    return "\n\n".join([*parts, READING.format(machine=named), toctree]) + "\n"
+    return "\n\n".join([*parts, READING, toctree]) + "\n"
 
 
 def page_of(section: dict[str, Any]) -> str:
@@ -111,7 +109,14 @@ def page_of(section: dict[str, Any]) -> str:
         for name, caption in section["figures"].items()
     ]
     differences = list(differences_of(section))
-    parts = [f"# {section['title']}", section["about"], "\n".join(rows), *figures]
+    named = MACHINE.format(**section["machine"])
+    parts = [
+        f"# {section['title']}",
+        section["about"],
+        "\n".join(rows),
+        named,
+        *figures,
+    ]
     if differences:
         parts += ["## Differences", "\n".join(differences)]
     return "\n\n".join(parts) + "\n"
@@ -137,9 +142,9 @@ def own_of(row: dict[str, Any]) -> dict[str, Any]:
 
 def number(value: float) -> str:
     """Return a number with two digits."""
-    if value == 0.0 or 1e-2 <= abs(value) < 100.0:
+    if value == 0.0 or 1e-2 <= abs(value) < 99.5:
         return f"{value:.2g}"
-    if 100.0 <= abs(value) < 1e5:
+    if 99.5 <= abs(value) < 1e5:
         return f"{value:.0f}"
     mantissa, _, exponent = f"{value:.1e}".partition("e")
     return f"{mantissa.removesuffix('.0')}e{int(exponent)}"

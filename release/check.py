@@ -20,6 +20,7 @@ import time
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -39,14 +40,11 @@ class Context:
 
     directory: Path
 
-    @property
+    @cached_property
     def wheel(self) -> Path:
-        """The wheel, built from the repository."""
-        found = sorted((self.directory / "dist").glob("*.whl"))
-        if not found:
-            run(sys.executable, "-m", "build", "--outdir", str(self.directory / "dist"), str(ROOT))
-            found = sorted((self.directory / "dist").glob("*.whl"))
-        return found[0]
+        """The wheel, built with the source distribution when it is first needed."""
+        run(sys.executable, "-m", "build", "--outdir", str(self.directory / "dist"), str(ROOT))
+        return next((self.directory / "dist").glob("*.whl"))
 
     @property
     def sdist(self) -> Path:
@@ -119,7 +117,7 @@ def check_api(_context: Context) -> str:
 
 def check_types(context: Context) -> str:
     """Measure which part of the public types pyright knows, in an environment without extras."""
-    python = environment(context, "")
+    python = core_environment(context)
     directory = context.directory / "empty"
     directory.mkdir(exist_ok=True)
     path = f"{python.parent}{os.pathsep}{os.environ['PATH']}"
@@ -128,7 +126,10 @@ def check_types(context: Context) -> str:
         cwd=directory, env={**os.environ, "PATH": path, "VIRTUAL_ENV": str(python.parents[1])}, capture_output=True,
         text=True, check=False,
     )  # fmt: skip
-    report = json.loads(found.stdout)["typeCompleteness"]
+    try:
+        report = json.loads(found.stdout)["typeCompleteness"]
+    except (ValueError, KeyError):
+        raise CheckError(f"pyright gave no report: {(found.stderr or found.stdout)[-500:]}") from None
     counts, score = report["exportedSymbolCounts"], report["completenessScore"]
     if not counts["withKnownType"] or score < MIN_TYPED:
         names = [each["name"] for each in report["symbols"] if each["isExported"] and not each["isTypeKnown"]]
@@ -138,14 +139,12 @@ def check_types(context: Context) -> str:
     return f"{100.0 * score:.2f} % of {sum(counts.values()):,} public symbols have known types"
 
 
-def environment(context: Context, extra: str) -> Path:
-    """Return the interpreter of a new environment with the wheel and an extra, or with none."""
-    directory = context.directory / f"env-{extra or 'core'}"
+def core_environment(context: Context) -> Path:
+    """Return the interpreter of a new environment with the wheel, without extras."""
+    directory = context.directory / "env"
     python = directory / "bin" / "python"
-    if not python.exists():
-        run(sys.executable, "-m", "venv", str(directory))
-        wheel = f"{context.wheel}[{extra}]" if extra else str(context.wheel)
-        run(str(python), "-m", "pip", "install", "--quiet", "--no-compile", wheel)
+    run(sys.executable, "-m", "venv", str(directory))
+    run(str(python), "-m", "pip", "install", "--quiet", "--no-compile", str(context.wheel))
     return python
 
 

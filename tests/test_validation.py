@@ -99,13 +99,14 @@ def test_pages_contain_every_row_and_figure():
     for section in STORED["sections"]:
         text = pages[f"{section['name']}.md"]
         assert section["name"] in pages["index.md"]
+        assert section["machine"]["processor"] in text
         assert all(row["what"].replace("|", "\\|") in text for row in section["rows"])
         assert all((ROOT / "docs" / "validation" / name).exists() and name in text for name in section["figures"])
 
 
 @pytest.mark.parametrize(
     ("value", "shown"),
-    [(0.0, "0"), (1e-6, "1e-6"), (4.44e-16, "4.4e-16"), (0.0213, "0.021"), (280.4, "280"), (2e6, "2e6")],
+    [(0.0, "0"), (1e-6, "1e-6"), (4.44e-16, "4.4e-16"), (0.0213, "0.021"), (99.7, "100"), (280.4, "280"), (2e6, "2e6")],
 )
 def test_numbers_have_two_digits(value, shown):
     assert PAGES["number"](value) == shown

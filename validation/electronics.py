@@ -17,12 +17,11 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
-from records import OWN, Section, largest_absolute, version_of
+from records import ERRORS, OWN, Section, in_errors, largest_absolute, version_of
 from scipy.constants import elementary_charge
 from scipy.constants import k as boltzmann
 from scipy.special import ndtr
@@ -30,20 +29,10 @@ from scipy.stats import poisson
 
 import foveasim as fs
 
-ERRORS = "standard errors"
 JANESICK = "Janesick, Photon Transfer (2007)"
 EMVA = "EMVA 1288, Release 4.0 Linear"
 LAYOUT = fs.layout.grid(n_x=250, n_y=200, pitch_um=3.0)
 N = LAYOUT.n_sites
-
-
-def in_errors(standard_error: Any) -> Callable[[Any, Any], float]:
-    """Return a deviation in standard errors."""
-
-    def deviation(found: Any, truth: Any) -> float:
-        return float(np.max(np.abs(np.asarray(found) - np.asarray(truth)) / standard_error))
-
-    return deviation
 
 
 # -- shot noise and full well -----------------------------------------------------------------------------------------

@@ -4,9 +4,8 @@ Published measurements, counts and claims, repeated with foveasim.
 The truth of a row is a printed value. Deviations are given in units of its rounding, half of its last digit, where nothing
 else limits the comparison; a model that is known to differ has a wider tolerance and says why. Values that are printed in a
 data sheet follow there from others with rounding of their own, so these rows have a tolerance of 1.2 %. Lengths that a source
-does not print are assumptions of the bundled layouts. Times of other programs
-are those that the paper prints, on its authors' computer, and cannot be repeated here: ISET and the simulator of the paper
-run in MATLAB.
+does not print are assumptions of the bundled layouts. Times of other programs are those that the paper prints, on its authors'
+computer, and cannot be repeated here: ISET and the simulator of the paper run in MATLAB.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from records import OWN, Section, largest, largest_absolute, largest_relative
+from records import ERRORS, OWN, Section, in_errors, largest, largest_absolute, largest_relative
 from scipy.optimize import brentq
 from scipy.special import ndtr
 from scipy.stats import qmc
@@ -220,8 +219,8 @@ def compare_read_noise(section: Section) -> None:
         by="μ/√(μ + σ²), cut at the full well",
         source=f"{PAPER}, Fig. 9, for the numbers",
         tolerance=4.0,
-        deviation=lambda found, expected: float(np.abs((found / expected - 1.0) * math.sqrt(2.0 * n)).max()),
-        of="standard errors",
+        deviation=in_errors(truth / math.sqrt(2.0 * n)),
+        of=ERRORS,
         repeats=0,
     )
 
@@ -384,8 +383,8 @@ def compare_sampling(section: Section, directory: Path) -> None:
         by="1, no peaks",
         source=yellott,
         tolerance=4.0,
-        deviation=lambda found, truth: abs(found - truth) / error,
-        of="standard errors",
+        deviation=in_errors(error),
+        of=ERRORS,
         repeats=0,
     )
     wave_per_mm = (140.0, 0.0)
@@ -584,7 +583,6 @@ def compare_events(section: Section) -> None:
             return np.array([np.unique(site).size / layout.n_sites for site in found])
 
         truth = ndtr((steps - threshold) / spread)
-        error = np.sqrt(truth * (1.0 - truth) / layout.n_sites)
         section.compare(
             f"S-curve of an array of {layout.n_sites:,} event pixels: {what}",
             {OWN: fractions},
@@ -592,8 +590,8 @@ def compare_events(section: Section) -> None:
             by="normal distribution with the published width",
             source=source,
             tolerance=4.0,
-            deviation=lambda found, expected, error=error: float(np.abs((found - expected) / error).max()),
-            of="standard errors",
+            deviation=in_errors(np.sqrt(truth * (1.0 - truth) / layout.n_sites)),
+            of=ERRORS,
             repeats=1,
         )
 

@@ -21,28 +21,33 @@ N_REPEATS = 3
 
 def largest(found: Any, truth: Any) -> float:
     """Return the largest absolute deviation over the largest absolute value of the truth."""
-    found, truth = np.asarray(found, np.float64), np.asarray(truth, np.float64)
-    if found.shape != truth.shape:
-        raise ValueError(f"shapes {found.shape} and {truth.shape} differ")
-    return float(np.abs(found - truth).max() / np.abs(truth).max())
+    return largest_absolute(found, truth) / float(np.abs(truth).max())
 
 
 def largest_relative(found: Any, truth: Any) -> float:
     """Return the largest deviation relative to each value of the truth."""
-    found, truth = np.asarray(found, np.float64), np.asarray(truth, np.float64)
-    if found.shape != truth.shape:
-        raise ValueError(f"shapes {found.shape} and {truth.shape} differ")
-    return float(np.abs(found / truth - 1.0).max())
+    return in_errors(np.abs(truth))(found, truth)
 
 
 def largest_absolute(found: Any, truth: Any) -> float:
     """Return the largest absolute deviation."""
-    found, truth = np.asarray(found, np.float64), np.asarray(truth, np.float64)
-    if found.shape != truth.shape:
-        raise ValueError(f"shapes {found.shape} and {truth.shape} differ")
-    return float(np.abs(found - truth).max())
+    return in_errors(1.0)(found, truth)
 
 
+def in_errors(standard_error: Any) -> Callable[[Any, Any], float]:
+    """Return a deviation in standard errors: the largest one."""
+
+    def deviation(found: Any, truth: Any) -> float:
+        found, truth = np.asarray(found, np.float64), np.asarray(truth, np.float64)
+        if found.shape != truth.shape:
+            raise ValueError(f"shapes {found.shape} and {truth.shape} differ")
+        return float(np.max(np.abs(found - truth) / standard_error))
+
+    return deviation
+
+
+#: Unit of deviations by :func:`in_errors`.
+ERRORS = "standard errors"
 #: What deviations are relative to, by their functions.
 OF = {largest: "of the maximum", largest_relative: "relative", largest_absolute: ""}
 
@@ -92,7 +97,7 @@ class Row:
 
 @dataclass
 class Section:
-    """Rows of a stage; ``figures``: captions by the name of the file."""
+    """Rows of a stage; ``figures``: captions by the name of the file; ``machine``: what its times depend on."""
 
     name: str
     title: str
@@ -100,6 +105,7 @@ class Section:
     rows: list[Row] = field(default_factory=list)
     figures: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
+    machine: dict[str, Any] = field(default_factory=dict)
 
     def compare(
         self,
@@ -190,7 +196,7 @@ class Section:
         return table
 
 
-def write(path: Path, sections: list[Section], about: Mapping[str, Any]) -> None:
+def write(path: Path, sections: list[Section]) -> None:
     """Write all sections as JSON."""
-    content = {**about, "sections": [asdict(section) for section in sections]}
+    content = {"sections": [asdict(section) for section in sections]}
     path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", "utf-8")

@@ -5,7 +5,7 @@ Each comparison has a tolerance for the deviation of foveasim from the truth. Th
 Results and figures are written to docs/validation, from which the pages of the documentation are built.
 
     python validation/run.py                      everything, at most 15 minutes on two cores
-    python validation/run.py diffraction events   some stages; the results of the others are kept
+    python validation/run.py diffraction timing   some stages; the results of the others are kept
 """
 
 from __future__ import annotations
@@ -91,7 +91,8 @@ def main() -> None:
     missed = []
     for name in chosen:
         module = importlib.import_module(name)
-        section = Section(name, STAGES[name], " ".join((module.__doc__ or "").split("\n\n", 1)[-1].split()))
+        about = " ".join((module.__doc__ or "").split("\n\n", 1)[-1].split())
+        section = Section(name, STAGES[name], about, machine=machine())
         start_s = time.perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", fs.errors.FoveasimWarning)
@@ -100,7 +101,7 @@ def main() -> None:
         console.print(section.table)
         missed += [f"{name}: {row.what}" for row in section.rows if not row.is_kept]
         sections[name] = section
-        write(RESULTS, [sections[each] for each in STAGES if each in sections], {"machine": machine()})
+        write(RESULTS, [sections[each] for each in STAGES if each in sections])
     n_rows = sum(len(sections[name].rows) for name in chosen)
     console.print(f"{n_rows} comparisons in {sum(sections[name].seconds for name in chosen):.0f} s")
     if missed:

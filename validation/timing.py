@@ -9,13 +9,11 @@ event pixels or spiking pixels; where a distribution is elementary, NumPy draws 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from records import OWN, Section, largest_absolute, largest_relative, version_of
+from records import ERRORS, OWN, Section, in_errors, largest_absolute, largest_relative, version_of
 from scipy.constants import elementary_charge
 from scipy.constants import k as boltzmann
 from scipy.special import ndtr
@@ -23,15 +21,9 @@ from scipy.stats import poisson
 
 import foveasim as fs
 
-ERRORS = "standard errors"
 N_SITES = 20_000
 SITES = fs.layout.grid(n_x=200, n_y=100, pitch_um=4.0)
 LICHTSTEINER = "Lichtsteiner, Posch and Delbruck, IEEE J. Solid-State Circuits 43, 566 (2008)"
-
-
-def in_errors(standard_error: Any) -> Callable[[Any, Any], float]:
-    """Return a deviation in standard errors."""
-    return lambda found, truth: float(np.max(np.abs(np.asarray(found) - np.asarray(truth)) / standard_error))
 
 
 # -- rolling shutter --------------------------------------------------------------------------------------------------

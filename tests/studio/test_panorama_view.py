@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from foveasim.studio._comparison import compare
 from foveasim.studio._engine import Engine
 from foveasim.studio._parts import PARTS
 
@@ -32,6 +33,26 @@ def shot(tmp_path):
         "sensor": {},
         "exposure_s": 0.001,
     }
+
+
+def compared(shot, **changes):
+    """Return the rows of two variants with other layouts, by name."""
+    grid = {"generator": "grid", "parameters": {"n_x": 24, "n_y": 24, "pitch_um": 80.0}}
+    shots = [shot | changes, shot | changes | {"layout": grid}]
+    results = [Engine(n_threads=1).simulate(json.loads(json.dumps(each))) for each in shots]
+    return {row["name"]: row["values"] for row in compare([("a", results[0]), ("b", results[1])])["rows"]}
+
+
+@pytest.mark.parametrize("gaze", [{"gaze_deg": [30.0, 0.0]}, {"gaze_um": [523.6, 0.0], "axis": "sensor"}])
+def test_variants_are_compared_at_the_gaze(shot, gaze):
+    """A camera that turns by 30 degrees sees what a camera ahead sees of the panorama that is turned by as much."""
+    turned = shot | {"scene": shot["scene"] | {"yaw_deg": 30.0}}
+    found, expected, ahead = compared(shot, **gaze), compared(turned), compared(shot)
+
+    for name in ("field_psnr_db", "fovea_psnr_db", "field_ssim"):
+        assert found[name] == pytest.approx(expected[name], rel=0.02), name
+        assert None not in found[name]
+    assert found["field_psnr_db"] != pytest.approx(ahead["field_psnr_db"], rel=0.02)
 
 
 def brightness(shot, **changes):
