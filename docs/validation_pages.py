@@ -40,7 +40,7 @@ def index_of(sections: list[dict[str, Any]]) -> str:
     ]
     for section in sections:
         names = [
-            one["program"].partition(",")[0]
+            one["program"].partition(", ")[0]
             for row in section["rows"]
             for one in row["results"]
         ]
