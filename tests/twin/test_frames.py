@@ -180,6 +180,26 @@ def test_levels_of_unknown_light_may_be_full():
         assert abs(each.value - value) < each.high - each.low, name
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "frames_seed"), [(43106, 45106), (43126, 43126)])
+def test_full_companded_levels_end_the_search(seed, frames_seed):
+    """
+    Gain and nonlinearity of unknown light are a valley of the likelihood, and its end is not its shallow part.
+
+    Wide codes of full pixels without noise are steps of the full well, which differences of a code width cross.
+    """
+    sensor, adc = camera_of(seed)
+    stacks = [
+        each if each.is_dark else fs.twin.Stack(each.frames, each.exposure_s) for each in stacks_of(sensor, frames_seed)
+    ]
+    found, truth = fs.twin.fit(stacks, pixel_um=3.0, **adc), truth_of(sensor)
+
+    assert found.chi_square_ratio < 2.0
+    for name in ("gain_dn_per_e", "nonlinearity_fraction", "full_well_e", "read_noise_e"):
+        each = found.estimates[name]
+        assert abs(each.value - truth[name]) < each.high - each.low, name
+
+
 def test_photons_give_the_quantum_efficiency():
     known = numpy_stacks(0.4, 4.0, 60.0, 8000.0)
     charges = 1.2 * 8000.0 * TIMES_S / TIMES_S[-1]

@@ -15,7 +15,7 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats
 from foveasim.layout.generators.grid import grid
 from foveasim.sensor import Sensor
-from foveasim.sensor.adc import QUANTISATION_DN2
+from foveasim.sensor.adc import ADC, QUANTISATION_DN2
 from foveasim.sensor.effects.measured import OffsetMap
 from foveasim.sensor.published.datasheet import SWING_V
 
@@ -122,7 +122,7 @@ class Chain:
     """
     Chain of a sensor for pixels at several levels.
 
-    ``known``: parameters of :class:`foveasim.Sensor` that are known, such as ``bits`` and ``companding``.
+    ``known``: parameters of its ADC.
     """
 
     known: Mapping[str, Any]
@@ -134,10 +134,15 @@ class Chain:
         """Layouts of the numbers of pixels so far."""
         return {}
 
+    @cached_property
+    def adc(self) -> ADC:
+        """ADC of the sensor."""
+        return ADC(**self.known)
+
     @property
     def n_codes(self) -> int:
         """Number of codes."""
-        return int(2 ** self.known["bits"])
+        return self.adc.n_codes
 
     def parameters(self, values: Mapping[str, float]) -> dict[str, Any]:
         """Return parameters of a sensor for those of a fit."""
@@ -156,7 +161,7 @@ class Chain:
         Noise over ``SMOOTH_SIGMA`` codes has the moments of the voltage, but for ``QUANTISATION_DN2``, to 1e-30: means and
         variances of finer codes follow from those of coarser ones, which are fewer.
         """
-        if self.known.get("companding", "linear") != "linear" or self.known.get("inl_dn"):
+        if not self.adc.is_linear:
             return 1
         sigma_dn = values["gain_dn_per_e"] * math.sqrt(max(values["read_noise_e2"], 0.0))
         return int(2 ** max(math.floor(math.log2(max(sigma_dn / SMOOTH_SIGMA, 1.0))), 0))

@@ -18,14 +18,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from foveasim._core.validation import Bools, Floats
+from foveasim.sensor.adc import QUANTISATION_DN2
 from foveasim.twin.fitting.chain import Chain, Moments
 from foveasim.twin.fitting.levels import Levels
 
 __all__ = ["Exposures", "PooledFit", "fit_levels"]
 
-#: Relative step of numerical derivatives, largest change of a logarithm in one iteration, largest number of iterations, and
-#: decrease of the sum of squares that ends them.
-STEP, MAX_CHANGE, MAX_ITERATIONS, TOLERANCE = 1e-4, 0.7, 40, 1e-2
+#: Relative step of numerical derivatives, largest change of a logarithm in one iteration, and largest number of iterations.
+STEP, MAX_CHANGE, MAX_ITERATIONS = 1e-4, 0.7, 60
+#: Decrease of the sum of squares that is expected of the next iteration, and relative one of the last, which end the search:
+#: the estimate is within a twentieth of a standard error, in every combination of parameters.
+TOLERANCE, RELATIVE_TOLERANCE = 2.5e-3, 1e-6
+#: Smallest eigenvalue of the correlations of derivatives that is no rounding.
+RANK = 1e-12
 #: Parameters whose logarithms are fitted.
 POSITIVE = ("gain_dn_per_e", "full_well_e", "qe", "light_e_per_s", "dark_doubling_k", "level_e")
 WELL, BEND = "full_well_e", "nonlinearity_fraction"
@@ -122,11 +127,13 @@ def fit_levels(
     for _ in range(MAX_ITERATIONS):
         jacobian = whiten(model.jacobian(vector, moments.statistics))
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+        before = float(residual @ residual)
+        if gradient @ _inverse(normal) @ gradient < TOLERANCE * max(1.0, before / residual.size):
+            break
         diagonal = np.diag(normal).copy()
         diagonal[diagonal <= 0.0] = 1.0
         # Logarithms of what the statistics do not determine, such as charges of full levels, move little.
         diagonal[model.is_log] = np.maximum(diagonal[model.is_log], 1.0)
-        before = float(residual @ residual)
         after = math.inf
         while damping < MAX_DAMPING:
             change = np.linalg.solve(normal + damping * np.diag(diagonal), gradient)
@@ -146,9 +153,22 @@ def fit_levels(
         vector, damping, moments = vector + change, damping / 10.0, proposed
         whiten = model.whitening(vector, moments)
         residual = whiten(model.residual(moments))
-        if before - after < TOLERANCE * max(1.0, after / residual.size):
+        if before - after < RELATIVE_TOLERANCE * after:
             break
     return model.result(vector, variance_error_dn2)
+
+
+def _inverse(matrix: Floats) -> Floats:
+    """
+    Return the inverse of a normal matrix where it has one.
+
+    Directions that the statistics do not determine are left out. Units of parameters must not decide which these are: the
+    diagonal is 1.
+    """
+    scale = np.sqrt(np.diag(matrix))
+    scale[scale <= 0.0] = 1.0
+    product = np.multiply.outer(scale, scale)
+    return np.asarray(np.linalg.pinv(matrix / product, hermitian=True, rcond=RANK) / product)
 
 
 @dataclass(eq=False)
@@ -166,6 +186,7 @@ class _Model:
         self.free = np.flatnonzero(self.exposures.is_free)
         positive = [any(name.startswith(each) for each in POSITIVE) for name in self.names]
         self.is_log = np.array([*positive, *[True] * self.free.size])
+        self.is_signal = np.array([*(name == WELL for name in self.names), *[True] * self.free.size])
 
     def pack(self, values: Mapping[str, float]) -> Floats:
         """
@@ -177,10 +198,7 @@ class _Model:
         gain = values["gain_dn_per_e"]
         found = np.array([*(values[name] for name in self.names), *self.start_e[self.free]], np.float64)
         found *= self._powers(gain)
-        if WELL in self.names:
-            k = self.names.index(WELL)
-            relative = found[k] / self.chain.n_codes
-            found[k] *= 1.0 - values.get(BEND, 0.0) * relative
+        found[self.is_signal] *= 1.0 - values.get(BEND, 0.0) * found[self.is_signal] / self.chain.n_codes
         return np.where(self.is_log, np.log(np.where(self.is_log, np.maximum(found, 1e-12), 1.0)), found)
 
     def _powers(self, gain: float) -> Floats:
@@ -192,11 +210,9 @@ class _Model:
         """Return the parameters, and the charges of levels of unknown light."""
         found = np.where(self.is_log, np.exp(np.minimum(vector, 40.0)), vector)
         gain = float(found[self.names.index("gain_dn_per_e")])
-        if WELL in self.names:
-            k = self.names.index(WELL)
-            bend = float(found[self.names.index(BEND)]) if BEND in self.names else 0.0
-            relative = found[k] / self.chain.n_codes
-            found[k] *= 2.0 / (1.0 + math.sqrt(max(1.0 - 4.0 * bend * relative, 0.0)))
+        bend = float(found[self.names.index(BEND)]) if BEND in self.names else 0.0
+        relative = found[self.is_signal] / self.chain.n_codes
+        found[self.is_signal] *= 2.0 / (1.0 + np.sqrt(np.maximum(1.0 - 4.0 * bend * relative, 0.0)))
         found = found / self._powers(gain)
         n = len(self.names)
         return dict(zip(self.names, found[:n].tolist(), strict=True)), found[n:]
@@ -253,12 +269,15 @@ class _Model:
         Return the variances of the statistics by what the chain describes to a part only.
 
         Between two codes, moments depend on where pixels are in a code: this effect of rounding decreases with the variance as
-        the Fourier transform of a Gaussian distribution.
+        the Fourier transform of a Gaussian distribution. Without noise, a mean is any value of its code, and a variance is as
+        uncertain as that of rounding.
         """
         variance = np.maximum(moments.variance_dn2, SMALLEST_DN2)
-        rough = np.exp(-2.0 * math.pi**2 * np.maximum(variance - ROUGH_DN2, 0.0))
-        of_mean = (ROUGH_MEAN_DN * rough) ** 2 + MEAN_FLOOR_DN**2
-        of_variance = (ROUGH_FRACTION * rough * variance) ** 2
+        rough, rounded = (
+            np.exp(-2.0 * math.pi**2 * np.maximum(variance - each, 0.0)) for each in (ROUGH_DN2, QUANTISATION_DN2)
+        )
+        of_mean = (ROUGH_MEAN_DN * rough) ** 2 + QUANTISATION_DN2 * rounded**2 + MEAN_FLOOR_DN**2
+        of_variance = (ROUGH_FRACTION * rough * variance) ** 2 + (QUANTISATION_DN2 * rounded) ** 2
         return np.concatenate((of_mean, of_variance)) + self._tail_errors(vector, moments) ** 2
 
     def _tail_errors(self, vector: Floats, moments: Moments) -> Floats:
@@ -302,10 +321,14 @@ class _Model:
         def change(step: Floats) -> Floats:
             return self.moments(vector + step).statistics - at
 
-        for k in range(n):
+        for k, name in enumerate(self.names):
             step = np.zeros(vector.size)
-            step[k] = STEP if self.is_log[k] else self._step(self.names[k], vector)
+            step[k] = STEP if self.is_log[k] else self._step(name, vector)
             found[:, k] = change(step) / step[k]
+            if name == WELL:
+                # Codes of full pixels without noise rise in steps: their slope is that over a code.
+                step[k] = max(STEP, 0.5 * self._full_code_fraction())
+                found[:, k] = (change(step) - change(-step)) / (2.0 * step[k])
         if self.free.size:
             step = np.zeros(vector.size)
             step[n:] = STEP
@@ -313,6 +336,12 @@ class _Model:
             for j, level in enumerate(self.free):
                 found[(level, n_levels + level), n + j] = of_all[[level, n_levels + level]]
         return found
+
+    def _full_code_fraction(self) -> float:
+        """Return the width of the highest code that occurs, as a fraction of its voltage."""
+        adc = self.chain.adc
+        code_dn = self.levels.mean_dn.max().clip(0.0, adc.n_codes - 1.0)
+        return float(adc.width_of_code_dn(code_dn) / (adc.linear_of_code_dn(code_dn) + 0.5))
 
     def _step(self, name: str, vector: Floats) -> float:
         value = float(vector[self.names.index(name)])
@@ -328,9 +357,7 @@ class _Model:
         whiten = self.whitening(vector, moments)
         noise, of_chain = self.noise(moments), self.chain_errors(vector, moments)
         jacobian = whiten(self.jacobian(vector, moments.statistics))
-        to_vector = (
-            np.linalg.pinv(jacobian.T @ jacobian, hermitian=True, rcond=1e-12) @ jacobian.T @ whiten(np.eye(noise.size))
-        )
+        to_vector = _inverse(jacobian.T @ jacobian) @ jacobian.T @ whiten(np.eye(noise.size))
         to_reported = np.empty((vector.size, vector.size))
         for k, step in enumerate(1e-5 * np.eye(vector.size)):
             to_reported[:, k] = (self.reported(vector + step) - self.reported(vector - step)) / 2e-5

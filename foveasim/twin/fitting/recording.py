@@ -23,8 +23,6 @@ __all__ = ["Recording"]
 LINEAR_FRACTION = 0.8
 #: Smallest number of rows and columns.
 MIN_LINES = 4
-#: ADC parameters of a sensor that a fit has to know.
-ADC_NAMES = ("companding", "log_strength", "companding_table", "inl_dn")
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +67,7 @@ class Recording:
             )
         if len({each.temperature_k is None for each in lights}) > 1:
             raise ParameterError("temperature_k", "must be given for all stacks, or for none")
-        adc = ADC(bits=known["bits"], **{name: known[name] for name in ADC_NAMES if name in known})
+        adc = ADC(**known)
         linear = statistics if adc.is_linear else [LinearStatistics.of_codes(each, adc) for each in statistics]
         classes = class_index(n_y, n_x, mosaic)
         return cls(statistics, linear, lights, known, adc, classes, int(classes.max()) + 1)
