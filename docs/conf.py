@@ -45,7 +45,7 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
 ]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "paper"]
 html_theme = "furo"
 html_title = f"foveasim {release}"
 html_logo = "_static/logo.svg"

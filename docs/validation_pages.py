@@ -22,6 +22,28 @@ READING = """\
 Times are the shortest of up to three calls, on the machine that each page names. They include what a program does for its
 result and no imports; a program that computes more than the comparison asks for takes longer. Run all of it yourself with
 `make validate`, or a stage with `python validation/run.py STAGE`."""
+#: Rows of the table in the paper: stage, beginning of the comparison, and its short form.
+PAPER_ROWS = (
+    (
+        "diffraction",
+        "PSF with defocus",
+        "PSF with defocus, coma and spherical aberration",
+    ),
+    ("image", "modulation of 10 waves", "modulation of waves on square photosites"),
+    ("distortion", "ideal points", "inverse of Brown and Conrady's model"),
+    ("distortion", "light of 672", "672 photosites behind a fisheye lens, to 105°"),
+    ("integration", "integrals over 1,440", "integrals over 1,440 log-polar sites"),
+    ("integration", "integrals over 240", "integrals over 240 sectors of annuli"),
+    ("resolution", "MTF of a hexagon of 7.3", "MTF of a hexagon"),
+    ("layouts", "minimum width of 1,998", "minimum width of 1,998 shapes"),
+    ("learning", "derivatives of the powers", "derivatives by vertices"),
+    ("learning", "adjoint of lens", "adjoint of lens and photosites"),
+)
+#: Lines between which the paper has its results.
+PAPER_MARKS = "<!-- results -->", "<!-- end of results -->"
+PAPER_TEXT = """\
+`make validate` compares every stage with closed forms and with other programs, on the same input and in the same run: {rows}
+comparisons in {stages} stages, of which {kept} are within their tolerances. Some of them, with the time of each program:"""
 MACHINE = "Times: {processor} with {cores} cores, {system}, Python {python}, foveasim {foveasim}."
 
 
@@ -55,11 +77,7 @@ def index_of(sections: list[dict[str, Any]]) -> str:
             f"{', '.join(programs) or 'closed forms'} | {section['seconds']:.0f} s |"
         )
     n_rows = sum(len(section["rows"]) for section in sections)
-    kept = sum(
-        own_of(row)["deviation"] <= row["tolerance"]
-        for section in sections
-        for row in section["rows"]
-    )
+    kept = sum(is_kept(row) for section in sections for row in section["rows"])
     toctree = "\n".join(
         [
             "```{toctree}",
@@ -122,6 +140,44 @@ def page_of(section: dict[str, Any]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def paper_of(text: str, results: dict[str, Any]) -> str:
+    """Return the text of the paper with these results."""
+    before, after = PAPER_MARKS
+    start, end = text.index(before) + len(before), text.index(after)
+    return f"{text[:start]}\n{paper_results(results['sections'])}\n{text[end:]}"
+
+
+def paper_results(sections: list[dict[str, Any]]) -> str:
+    """Return the summary of all comparisons, and a table of some."""
+    rows = [row for section in sections for row in section["rows"]]
+    lines = [
+        PAPER_TEXT.format(
+            rows=len(rows), stages=len(sections), kept=sum(map(is_kept, rows))
+        ),
+        "",
+        "| comparison | foveasim | other programs |",
+        "|---|---|---|",
+    ]
+    named = {section["name"]: section["rows"] for section in sections}
+    for stage, start, short in PAPER_ROWS:
+        row = next(row for row in named[stage] if row["what"].startswith(start))
+        own = own_of(row)
+        others = [
+            f"{one['program']}: {measured(one)}"
+            for one in row["results"]
+            if OWN not in one["program"]
+        ]
+        of = f", {row['of']}" if row["of"] else ""
+        lines.append(f"| {short}{of} | {measured(own)} | {'; '.join(others)} |")
+    return "\n".join(lines)
+
+
+def measured(one: dict[str, Any]) -> str:
+    """Return the deviation of a program, and its time."""
+    took = "" if one["seconds"] is None else f", {time_of(one['seconds'])}"
+    return f"{number(one['deviation'])}{took}"
+
+
 def differences_of(section: dict[str, Any]) -> Iterator[str]:
     """Yield what explains deviations, and what other programs do not offer, as items of a list."""
     for row in section["rows"]:
@@ -138,6 +194,11 @@ def differences_of(section: dict[str, Any]) -> Iterator[str]:
 def own_of(row: dict[str, Any]) -> dict[str, Any]:
     """Return the result of foveasim."""
     return next(one for one in row["results"] if one["program"] == OWN)
+
+
+def is_kept(row: dict[str, Any]) -> bool:
+    """Return whether foveasim is within the tolerance."""
+    return own_of(row)["deviation"] <= row["tolerance"]
 
 
 def number(value: float) -> str:

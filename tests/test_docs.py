@@ -181,6 +181,27 @@ def test_all_pages_are_found():
     assert sum(len(TARGET.findall(page.read_text())) for page in pages_of(ROOT)) >= 25
 
 
+@pytest.mark.parametrize(
+    ("target", "answer"),
+    [
+        ("validation/index.md", ""),
+        ("benchmarks.md", "| reference | ratio |"),
+        ("guides/sensors.md#presets", '"machine_vision"'),
+        ("extending/own_effects.md", "EFFECTS.register"),
+        ("citing.md", "@software{foveasim"),
+    ],
+)
+def test_first_page_leads_to_answers(target, answer):
+    """How accurate and how fast it is, which sensors it contains, how to add a noise source, and how to cite it."""
+    docs = ROOT / "docs"
+    name = target.partition("#")[0]
+
+    assert f"]({target})" in (docs / "index.md").read_text("utf-8")
+    assert Path(name) in names_of("generated_pages.py")["generated_pages"](ROOT) or answer in (docs / name).read_text(
+        "utf-8"
+    )
+
+
 def write_repository(root, links):
     """Write two pages and one gallery script, in a directory with the name of a generated one."""
     for folder in ("docs/guides", "docs/gallery", "gallery"):

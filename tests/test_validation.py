@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import runpy
 import sys
 from importlib import import_module
@@ -102,6 +103,19 @@ def test_pages_contain_every_row_and_figure():
         assert section["machine"]["processor"] in text
         assert all(row["what"].replace("|", "\\|") in text for row in section["rows"])
         assert all((ROOT / "docs" / "validation" / name).exists() and name in text for name in section["figures"])
+
+
+def test_paper_has_the_stored_results():
+    paper = ROOT / "docs" / "paper" / "paper.md"
+    text, keys = paper.read_text("utf-8"), paper.with_name("paper.bib").read_text("utf-8")
+
+    assert PAGES["paper_of"](text, STORED) == text
+    assert f"{len(ROWS)}\ncomparisons in" in text
+    cited = set(re.findall(r"@(\w+)", text.partition("# Summary")[2]))
+    assert cited == set(re.findall(r"^@\w+\{(\w+),", keys, re.MULTILINE))
+    figures = re.findall(r"\]\((\S+)\)", text)
+    assert len(figures) == 3
+    assert all((paper.parent / name).exists() for name in figures)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,8 @@
 Compare every stage with closed forms and with other programs, on the same input, in one run.
 
 Each comparison has a tolerance for the deviation of foveasim from the truth. The program exits with 1 when one is missed.
-Results and figures are written to docs/validation, from which the pages of the documentation are built.
+Results and figures are written to docs/validation, from which the pages of the documentation are built, and the table of the
+paper, docs/paper/paper.md, is written from them.
 
     python validation/run.py                      everything, at most 15 minutes on two cores
     python validation/run.py diffraction timing   some stages; the results of the others are kept
@@ -15,6 +16,7 @@ import importlib
 import json
 import os
 import platform
+import runpy
 import sys
 import time
 import warnings
@@ -50,6 +52,7 @@ STAGES = {
 NEEDS = {"learning": "torch"}
 DIRECTORY = Path(__file__).parents[1] / "docs" / "validation"
 RESULTS = DIRECTORY / "results.json"
+PAPER = DIRECTORY.parent / "paper" / "paper.md"
 console = Console(width=140)
 
 
@@ -102,6 +105,9 @@ def main() -> None:
         missed += [f"{name}: {row.what}" for row in section.rows if not row.is_kept]
         sections[name] = section
         write(RESULTS, [sections[each] for each in STAGES if each in sections])
+    if STAGES.keys() <= sections.keys():
+        paper_of = runpy.run_path(str(DIRECTORY.parent / "validation_pages.py"))["paper_of"]
+        PAPER.write_text(paper_of(PAPER.read_text("utf-8"), json.loads(RESULTS.read_text("utf-8"))), "utf-8")
     n_rows = sum(len(sections[name].rows) for name in chosen)
     console.print(f"{n_rows} comparisons in {sum(sections[name].seconds for name in chosen):.0f} s")
     if missed:
