@@ -31,6 +31,8 @@ TAIL = (1 / 256, 1 / 64, 1 / 16, 1 / 4, 1 / 2)
 SAME_SPREAD = 0.02
 #: Standard deviation of noise, in codes, from which quantisation adds the variance of a uniform distribution.
 SMOOTH_SIGMA = 2.0
+#: Variance of the noise, e-², below which moments continue as straight lines: codes of whole electrons without noise are steps.
+SMOOTH_E2 = 0.25
 #: Largest nonlinearity in a search.
 MAX_BEND = 0.45
 #: Standard deviations of the charge below the full well from which it matters, and a full well that does not, e-.
@@ -150,7 +152,7 @@ class Chain:
             "gain_dn_per_e": values["gain_dn_per_e"],
             "v_sat_v": SWING_V,
             "pedestal_v": SWING_V * max(values["black_level_dn"] + 0.5, 0.0) / self.n_codes,
-            "read_noise_e": math.sqrt(max(values["read_noise_e2"], 0.0)),
+            "read_noise_e": math.sqrt(max(values["read_noise_e2"], SMOOTH_E2)),
             "nonlinearity_fraction": min(max(values.get("nonlinearity_fraction", 0.0), -MAX_BEND), MAX_BEND),
         }
 
@@ -196,7 +198,7 @@ class Chain:
         slope = step * np.broadcast_to(sensor.linearise(charge_e).gain_dn_per_e, charge_e.size)
         # Estimates of a dark current or a noise of 0 are negative for half of the devices: moments continue as straight lines.
         mean = mean + slope * (signed_e - charge_e)
-        variance = variance + slope**2 * (signed_e - charge_e + min(values["read_noise_e2"], 0.0))
+        variance = variance + slope**2 * (signed_e - charge_e + min(values["read_noise_e2"] - SMOOTH_E2, 0.0))
         means, variances, slopes = (
             np.bincount(index, share * each).reshape(self.n_levels, -1) for each in (mean, variance, slope)
         )
