@@ -1,8 +1,10 @@
 # Every target creates its environment and installs its requirements, with Python 3.11 or later and make.
 
-PYTHON ?= python3
+# On Windows, targets run in a shell such as that of Git, and environments have their programs in Scripts.
+PYTHON ?= $(if $(filter Windows_NT,$(OS)),python,python3)
+SCRIPTS := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
 VENV := .venv
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(SCRIPTS)
 OUT ?= out
 # Modules are compiled to bytecode when they are imported: most of those of the dependencies never are.
 INSTALL := -m pip install --quiet --no-compile
@@ -12,12 +14,15 @@ PYTEST_ARGS ?=
 unexport PYTHONDONTWRITEBYTECODE
 PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 # Slow tests often wait for other programs and for browsers: one process more than there are cores, at most five.
-WAITING := $(PARALLEL) --numprocesses $(shell n=$$(getconf _NPROCESSORS_ONLN) && echo $$((n < 4 ? n + 1 : 5)))
+WAITING = $(PARALLEL) --numprocesses $(shell n=$$(getconf _NPROCESSORS_ONLN) && echo $$((n < 4 ? n + 1 : 5)))
 
 # Lower bounds of pyproject.toml on the oldest Python: .venv-lowest/uv resolves them, .venv-lowest/env contains them.
 LOWEST := .venv-lowest
 LOWEST_PYTHON ?= 3.11
-UV := $(LOWEST)/uv/bin/uv
+UV := $(LOWEST)/uv/$(SCRIPTS)/uv
+# Arguments of release/check.py and benchmarks/gpu.py.
+CHECK_ARGS ?=
+GPU_ARGS ?=
 # Effort of the tests in the other environments: all, or default without the slow ones.
 EFFORT ?= all
 # PyTorch has a separate environment, since its wheel may install gigabytes of CUDA libraries.
@@ -28,7 +33,7 @@ CHECK_PYTHON = command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found; s
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	{ echo "foveasim requires Python 3.11 or later; specify one with: make PYTHON=python3.12"; exit 1; }
 
-.PHONY: demo test test-all test-nightly test-pages test-core test-lowest test-torch test-interop soak lint lint-js bench bench-torch validate release-check peers docs clean
+.PHONY: demo test test-all test-nightly test-pages test-core test-lowest test-torch test-gpu test-interop soak lint lint-js bench bench-torch validate release-check peers docs clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.installed
@@ -42,10 +47,10 @@ test: $(VENV)/.installed-dev
 test-core:
 	@$(CHECK_PYTHON)
 	directory=$$(mktemp -d) && trap 'rm -rf "$$directory"' EXIT && $(PYTHON) -m venv "$$directory/env" && \
-		"$$directory/env/bin/python" -m pip wheel --quiet --no-deps --wheel-dir "$$directory" . && \
-		"$$directory/env/bin/python" -m pip install --quiet "$$directory"/foveasim-*.whl && \
+		"$$directory/env/$(SCRIPTS)/python" -m pip wheel --quiet --no-deps --wheel-dir "$$directory" . && \
+		"$$directory/env/$(SCRIPTS)/python" -m pip install --quiet "$$directory"/foveasim-*.whl && \
 		cp tests/installation/calls.py "$$directory" && cd "$$directory" && MPLBACKEND=agg env -u PYTHONPATH \
-		env/bin/python calls.py --program env/bin/foveasim
+		env/$(SCRIPTS)/python calls.py --program env/$(SCRIPTS)/foveasim
 
 # The slow tests, too, those in a browser, all pairs of features and invariants in tests/compositions instead of a sample, and a third
 # of the tests marked nightly, which FOVEASIM_TESTS_COMMIT selects.
@@ -62,21 +67,25 @@ test-pages: $(VENV)/.installed-dev
 
 # Deprecation warnings between old versions of dependencies are ignored.
 test-lowest: $(LOWEST)/.installed
-	FOVEASIM_TESTS=$(EFFORT) NUMBA_CACHE_DIR="$(CURDIR)/$(LOWEST)/numba" $(LOWEST)/env/bin/python -m pytest $(PARALLEL) \
+	FOVEASIM_TESTS=$(EFFORT) NUMBA_CACHE_DIR="$(CURDIR)/$(LOWEST)/numba" $(LOWEST)/env/$(SCRIPTS)/python -m pytest $(PARALLEL) \
 		-W default::DeprecationWarning -W default::PendingDeprecationWarning -W error::pytest.PytestWarning $(PYTEST_ARGS)
 
 test-torch: $(TORCH_VENV)/.installed
-	FOVEASIM_TESTS=$(EFFORT) FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) tests/learn \
+	FOVEASIM_TESTS=$(EFFORT) FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/$(SCRIPTS)/python -m pytest $(PARALLEL) tests/learn \
 		tests/integrate/test_vertex_gradient.py tests/explore/test_dataset_torch.py $(PYTEST_ARGS)
-	FOVEASIM_TESTS=$(EFFORT) FOVEASIM_TESTS_NEED=torch,deepinv,torchvision $(TORCH_VENV)/bin/python -m pytest $(PARALLEL) tests/test_docs.py \
+	FOVEASIM_TESTS=$(EFFORT) FOVEASIM_TESTS_NEED=torch,deepinv,torchvision $(TORCH_VENV)/$(SCRIPTS)/python -m pytest $(PARALLEL) tests/test_docs.py \
 		tests/test_doctests.py tests/test_gallery.py tests/test_notebooks.py tests/installation -k "torch or learn or adapters" $(PYTEST_ARGS)
+
+# Tests and rates of the layers of PyTorch on a GPU, at most six minutes after installation; without a GPU, only says so.
+test-gpu: $(TORCH_VENV)/.installed
+	$(TORCH_VENV)/$(SCRIPTS)/python benchmarks/gpu.py $(GPU_ARGS)
 
 # Files of other programs, which these write and read; their dependencies may have deprecation warnings among each other.
 test-interop: $(INTEROP_VENV)/.installed
-	FOVEASIM_TESTS=all FOVEASIM_TESTS_NEED=interop $(INTEROP_VENV)/bin/python -m pytest $(PARALLEL) -W default::DeprecationWarning tests/interop \
+	FOVEASIM_TESTS=all FOVEASIM_TESTS_NEED=interop $(INTEROP_VENV)/$(SCRIPTS)/python -m pytest $(PARALLEL) -W default::DeprecationWarning tests/interop \
 		tests/distortion/test_calibration_files.py tests/_io/test_picture_colours.py tests/video/test_frame_times.py \
 		tests/video/test_video_colours.py $(PYTEST_ARGS)
-	FOVEASIM_TESTS=all $(INTEROP_VENV)/bin/python -m pytest $(PARALLEL) -W default::DeprecationWarning tests/layout/files/test_chip_records.py tests/maps/test_maps.py \
+	FOVEASIM_TESTS=all $(INTEROP_VENV)/$(SCRIPTS)/python -m pytest $(PARALLEL) -W default::DeprecationWarning tests/layout/files/test_chip_records.py tests/maps/test_maps.py \
 		-k "klayout or gdstk or astropy" $(PYTEST_ARGS)
 
 # Kills workers at random for some minutes: every item must be computed, or have lost its worker three times.
@@ -99,17 +108,18 @@ bench: $(VENV)/.installed-dev
 
 # Training steps of layouts, against soft masks.
 bench-torch: $(TORCH_VENV)/.installed
-	$(TORCH_VENV)/bin/python benchmarks/gradients.py
-	$(TORCH_VENV)/bin/python benchmarks/sensor_layers.py
+	$(TORCH_VENV)/$(SCRIPTS)/python benchmarks/gradients.py
+	$(TORCH_VENV)/$(SCRIPTS)/python benchmarks/sensor_layers.py
 
 # Every stage against closed forms and other programs; results for the pages in docs/validation.
 validate: $(VENV)/.installed-validate $(TORCH_VENV)/.installed
 	$(BIN)/python validation/run.py
-	$(TORCH_VENV)/bin/python validation/run.py learning
+	$(TORCH_VENV)/$(SCRIPTS)/python validation/run.py learning
 
-# What is built, installed and documented, before a release.
+# What is built, installed and documented, before a release; some checks with CHECK_ARGS="build version", others without the extras of
+# gigabytes with CHECK_ARGS="--without learn adapters".
 release-check: $(VENV)/.installed-release
-	$(BIN)/python release/check.py
+	$(BIN)/python release/check.py $(CHECK_ARGS)
 
 # The same work with other libraries.
 peers: $(VENV)/.installed-dev
@@ -160,21 +170,21 @@ $(VENV)/.installed-docs: $(VENV)/.made pyproject.toml
 # Pins the oldest build backend, too, since uv selects the newest.
 $(LOWEST)/.installed: $(LOWEST)/uv/.made pyproject.toml
 	@echo "installing the lower bounds of the dependencies into $(LOWEST) (a minute or so)"
-	$(LOWEST)/uv/bin/python -m pip install --quiet uv
+	$(LOWEST)/uv/$(SCRIPTS)/python -m pip install --quiet uv
 	$(UV) venv --quiet --clear --python $(LOWEST_PYTHON) $(LOWEST)/env
-	$(LOWEST)/uv/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' | \
-		$(UV) pip compile --quiet --python $(LOWEST)/env/bin/python --resolution lowest-direct --output-file $(LOWEST)/build.txt -
-	$(UV) pip install --quiet --python $(LOWEST)/env/bin/python --resolution lowest-direct --build-constraints $(LOWEST)/build.txt \
+	$(LOWEST)/uv/$(SCRIPTS)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' | \
+		$(UV) pip compile --quiet --python $(LOWEST)/env/$(SCRIPTS)/python --resolution lowest-direct --output-file $(LOWEST)/build.txt -
+	$(UV) pip install --quiet --python $(LOWEST)/env/$(SCRIPTS)/python --resolution lowest-direct --build-constraints $(LOWEST)/build.txt \
 		--editable '.[dev,docs]'
 	touch $@
 
 $(TORCH_VENV)/.installed: $(TORCH_VENV)/.made pyproject.toml
 	@echo "installing foveasim and PyTorch into $(TORCH_VENV) (minutes with CUDA)"
-	$(TORCH_VENV)/bin/python $(INSTALL) --editable '.[adapters,explore,layout,learn]' hypothesis ipykernel nbclient onnxruntime onnxscript pytest \
+	$(TORCH_VENV)/$(SCRIPTS)/python $(INSTALL) --editable '.[adapters,explore,layout,learn]' hypothesis ipykernel nbclient onnxruntime onnxscript pytest \
 		pytest-timeout pytest-xdist
 	touch $@
 
 $(INTEROP_VENV)/.installed: $(INTEROP_VENV)/.made pyproject.toml
 	@echo "installing foveasim and the programs whose files it reads into $(INTEROP_VENV) (minutes)"
-	$(INTEROP_VENV)/bin/python $(INSTALL) --editable '.[interop]'
+	$(INTEROP_VENV)/$(SCRIPTS)/python $(INSTALL) --editable '.[interop]'
 	touch $@

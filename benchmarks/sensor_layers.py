@@ -4,7 +4,7 @@ Cameras as layers of PyTorch, against their Fourier transforms and sparse produc
     python benchmarks/sensor_layers.py             everything (make bench-torch)
     python benchmarks/sensor_layers.py --quick     small batches, without bounds
 
-Runs on a GPU where PyTorch has one, and prints the rate at which the layer moves data relative to a copy in memory.
+Runs on a GPU where PyTorch has one. One row is the rate at which the layer moves data, relative to a copy in memory.
 """
 
 from __future__ import annotations
@@ -79,10 +79,10 @@ def bench_layer(report: Report, n_pictures: int, n_pixels: int, device: torch.de
     copied = torch.empty_like(padded)
     copy_s = best_s({"copy": synchronised(lambda: copied.copy_(padded))}, 7)["copy"]  # type: ignore[dict-item]
     copy_gb_s = 1e-9 * 2 * padded.numel() * padded.element_size() / copy_s
-    name = torch.cuda.get_device_name() if device.type == "cuda" else "CPU"
-    console.print(
-        f"{name}: {layer_gb_s:.3g} GB/s of pictures, spectra and maps, {layer_gb_s / copy_gb_s:.2f} x a copy in memory"
-    )
+    report.add(
+        "pictures, spectra and maps", f"{layer_gb_s:.3g} GB/s", "copy in memory", f"{copy_gb_s:.3g} GB/s",
+        layer_gb_s / copy_gb_s, None, is_lower_bound=True,
+    )  # fmt: skip
 
 
 def bench_training(report: Report, n_pictures: int, n_pixels: int, device: torch.device) -> None:

@@ -21,6 +21,7 @@ sys.path[:0] = [str(HERE), str(HERE.parent / "gallery")]
 import code_results  # noqa: E402 -- of this directory
 import dark_figures  # noqa: E402
 import generated_pages  # noqa: E402
+import installation_tables  # noqa: E402
 import validation_pages  # noqa: E402
 from docutils import nodes  # noqa: E402
 from sphinx.ext import autosummary  # noqa: E402
@@ -166,6 +167,7 @@ def setup(app: Sphinx) -> None:
         generated_pages.write_published_sensors,
         generated_pages.write_gallery,
         validation_pages.write_validation,
+        installation_tables.write_licences,
     ):
         app.connect("config-inited", write)
     app.add_transform(Results)

@@ -3,6 +3,7 @@ Checks before a release: what is built and documented is what the repository say
 
     python release/check.py                     all checks
     python release/check.py build types api     some of them
+    python release/check.py installations licences --without learn adapters     without those of gigabytes
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -23,22 +25,33 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from installations import CORE, RESULTS, measure, new_environment, read_results, write_results
+from licences import exceptions, question_of
+from programs import CheckError, run
+
+from foveasim._core.extras import EXTRA_OF
+
 ROOT = Path(__file__).parents[1]
 #: Largest size of the wheel, 10^6 bytes.
 MAX_WHEEL_MB = 4.0
 #: Smallest part of the public symbols whose types pyright knows.
 MIN_TYPED = 0.99
-
-
-class CheckError(Exception):
-    """A release check that fails."""
+#: Largest size of the installed core, 10^6 bytes.
+MAX_CORE_MB = 600.0
+#: Extras with modules that the package imports.
+EXTRAS = sorted(set(EXTRA_OF.values()))
 
 
 @dataclass
 class Context:
-    """Temporary directory, with the wheel and the source distribution once they are built."""
+    """
+    Temporary directory, with the wheel and the source distribution once they are built.
+
+    ``without``: extras that are not installed.
+    """
 
     directory: Path
+    without: tuple[str, ...] = ()
 
     @cached_property
     def wheel(self) -> Path:
@@ -55,17 +68,6 @@ class Context:
     def version(self) -> str:
         """Version of the wheel."""
         return self.wheel.name.split("-")[1]
-
-
-def run(*command: str, cwd: Path | None = None, **variables: str) -> str:
-    """Run a program and return what it prints; raise CheckError with its last lines if it fails."""
-    found = subprocess.run(
-        command, cwd=cwd, env={**os.environ, **variables}, capture_output=True, text=True, check=False
-    )
-    if found.returncode:
-        last = "\n".join((found.stdout + found.stderr).splitlines()[-20:])
-        raise CheckError(f"{' '.join(command[:4])} ... failed:\n{last}")
-    return found.stdout
 
 
 def members(wheel: Path) -> dict[str, str]:
@@ -117,7 +119,7 @@ def check_api(_context: Context) -> str:
 
 def check_types(context: Context) -> str:
     """Measure which part of the public types pyright knows, in an environment without extras."""
-    python = core_environment(context)
+    python = new_environment(context.directory / "env", str(context.wheel))
     directory = context.directory / "empty"
     directory.mkdir(exist_ok=True)
     path = f"{python.parent}{os.pathsep}{os.environ['PATH']}"
@@ -139,13 +141,48 @@ def check_types(context: Context) -> str:
     return f"{100.0 * score:.2f} % of {sum(counts.values()):,} public symbols have known types"
 
 
-def core_environment(context: Context) -> Path:
-    """Return the interpreter of a new environment with the wheel, without extras."""
-    directory = context.directory / "env"
-    python = directory / "bin" / "python"
-    run(sys.executable, "-m", "venv", str(directory))
-    run(str(python), "-m", "pip", "install", "--quiet", "--no-compile", str(context.wheel))
-    return python
+def check_installations(context: Context) -> str:
+    """Install the core and each extra alone: every call works, or names the extra that it requires."""
+    records = read_results()
+    chosen = [name for name in EXTRAS if name not in context.without]
+    records[CORE], calls = measure(context.wheel, CORE, context.directory / CORE)
+    write_results(records, [CORE, *EXTRAS])
+    failed = []
+    for extra in chosen:
+        names = [name for name, required in calls.items() if required == extra]
+        try:
+            if not names:
+                raise CheckError(f"no call requires the extra {extra}")
+            records[extra], _ = measure(context.wheel, extra, context.directory / extra, records[CORE], names)
+        except CheckError as error:
+            failed.append(f"{extra}: {error}")
+        write_results(records, [CORE, *EXTRAS])
+    if failed:
+        raise CheckError("\n".join(failed))
+    size_mb = records[CORE]["mb"]
+    if size_mb > MAX_CORE_MB:
+        raise CheckError(f"the core has {size_mb:.0f} MB, at most {MAX_CORE_MB:g}")
+    n_core = sum(not required for required in calls.values())
+    left_out = f"; not installed: {', '.join(context.without)}" if context.without else ""
+    return (
+        f"core of {size_mb:.0f} MB with {n_core} of {len(calls)} calls, the others with {len(chosen)} extras, "
+        f"each alone{left_out}"
+    )
+
+
+def check_licences(context: Context) -> str:
+    """Judge the licences of all distributions that the check of the installations found, now or earlier."""
+    records = read_results()
+    if missing := [name for name in (CORE, *EXTRAS) if name not in records and name not in context.without]:
+        raise CheckError(f"{RESULTS.name} lacks {', '.join(missing)}; run: python release/check.py installations")
+    found = {name: record for each in records.values() for name, record in each["distributions"].items()}
+    reasons = exceptions(found)
+    core = records[CORE]["distributions"]
+    if wrong := [name for name, reason in reasons.items() if not reason or name in core]:
+        stated = ", ".join(f"{name} ({question_of(found[name])})" for name in wrong)
+        raise CheckError(f"neither allowed, nor an exception of an extra with a reason: {stated}")
+    listed = f"{len(reasons)} exceptions: {', '.join(reasons)}" if reasons else "no exception"
+    return f"{len(found)} distributions, {listed}"
 
 
 def check_docs(_context: Context) -> str:
@@ -159,6 +196,8 @@ CHECKS: dict[str, Callable[[Context], str]] = {
     "version": check_version,
     "api": check_api,
     "types": check_types,
+    "installations": check_installations,
+    "licences": check_licences,
     "docs": check_docs,
 }
 
@@ -167,12 +206,23 @@ def main() -> None:
     """Run the checks that the command line names, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="CHECK", help=f"one of {', '.join(CHECKS)}; by default all")
-    chosen = parser.parse_args().names or list(CHECKS)
+    parser.add_argument(
+        "--without",
+        nargs="+",
+        default=[],
+        metavar="EXTRA",
+        help=f"extras that are not installed, of {', '.join(EXTRAS)}",
+    )
+    parser.add_argument("--keep", type=Path, metavar="DIRECTORY", help="where wheel and source distribution are kept")
+    options = parser.parse_args()
+    chosen = options.names or list(CHECKS)
     if unknown := [name for name in chosen if name not in CHECKS]:
         parser.error(f"unknown checks: {', '.join(unknown)}; possible: {', '.join(CHECKS)}")
+    if unknown := [name for name in options.without if name not in EXTRAS]:
+        parser.error(f"unknown extras: {', '.join(unknown)}; possible: {', '.join(EXTRAS)}")
     failed = []
     with tempfile.TemporaryDirectory() as directory:
-        context = Context(Path(directory))
+        context = Context(Path(directory), tuple(options.without))
         for name in chosen:
             start_s = time.perf_counter()
             try:
@@ -181,6 +231,8 @@ def main() -> None:
                 failed.append(name)
                 verdict = f"FAILED: {error}"
             print(f"{name} ({time.perf_counter() - start_s:.0f} s): {verdict}", flush=True)
+        if options.keep and not failed:
+            shutil.copytree(context.wheel.parent, options.keep, dirs_exist_ok=True)
     if failed:
         sys.exit(f"failed: {', '.join(failed)}")
 

@@ -32,7 +32,7 @@ def module_of(monkeypatch):
     monkeypatch.setattr(sys, "path", [str(BENCHMARKS), *sys.path])
     before = set(sys.modules)
     yield import_module
-    for name in {"fault_probes", "fault_selection", "machine", "report"} - before:
+    for name in {"fault_probes", "fault_selection", "gpu", "machine", "report"} - before:
         sys.modules.pop(name, None)
 
 
@@ -110,3 +110,27 @@ def test_kernel_is_probed_in_its_callers(module_of):
     found = module_of("fault_probes").probed({"a/_kernels.py": kernels, "a/b.py": caller}, fault)
 
     assert [(path, function.lineno) for path, function in found] == [("a/b.py", 2)]
+
+
+def test_machines_without_gpu_run_nothing(module_of, monkeypatch, capsys, tmp_path):
+    gpu = module_of("gpu")
+    monkeypatch.setattr(gpu, "has_gpu", lambda: False)
+    monkeypatch.setattr(gpu, "run_tests", lambda device: pytest.fail("tests were run"))
+    monkeypatch.setattr(sys, "argv", ["gpu.py", "--out", str(tmp_path / "gpu.json")])
+    gpu.main()
+
+    assert capsys.readouterr().out == "PyTorch finds no CUDA device here; nothing was run.\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_failed_tests_of_device_end_the_run(module_of, monkeypatch, tmp_path):
+    gpu = module_of("gpu")
+    monkeypatch.setattr(gpu, "ROOT", tmp_path)
+    (tmp_path / "tests" / "learn").mkdir(parents=True)
+    (tmp_path / "tests" / "learn" / "test_one.py").write_text(
+        "import pytest\n@pytest.mark.parametrize('device', ['cpu', 'cuda'])\ndef test_one(device):\n    assert device == 'cpu'\n"
+    )
+
+    assert gpu.run_tests("cpu").startswith("1 passed, 1 deselected")
+    with pytest.raises(SystemExit, match=r"test_one\[cuda\]"):
+        gpu.run_tests("cuda")

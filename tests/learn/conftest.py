@@ -1,7 +1,8 @@
 """
 One thread of PyTorch per process: several processes with several threads each would wait for each other.
 
-Tests with the fixture ``device`` run on all devices that the machine has, and on ``meta``, whose tensors have no values.
+Tests with the fixture ``device`` run on all devices that the machine has, and on ``meta``, whose tensors have no values; those
+of derivatives, with the fixture ``real_device``, run on the former only. ``make test-gpu`` runs both on a GPU.
 """
 
 from __future__ import annotations
@@ -23,6 +24,11 @@ if find_spec("torch"):
 
 @pytest.fixture(params=DEVICES)
 def device(request):
+    return torch.device(request.param)
+
+
+@pytest.fixture(params=[name for name in DEVICES if name != "meta"])
+def real_device(request):
     return torch.device(request.param)
 
 
