@@ -36,6 +36,8 @@ from foveasim.errors import FileError
 #: Memory of the process and its libraries, and number of copies of the data in memory.
 BASE_BYTES, DATA_COPIES = 2**31, 3
 MAX_CPU_S, BYTES_PER_S = 10, 2**22
+#: Exit code of a process at the limit of its processor time; none on Windows.
+PROCESSOR_TIME_CODES = (-signal.SIGXCPU,) if hasattr(signal, "SIGXCPU") else ()
 #: Ratio of the wall time limit to the processor time limit, for busy machines.
 WALL_TIME_FACTOR = 5
 COMMAND = (sys.executable, "-P", str(Path(__file__).with_name("_sandboxed.py")))
@@ -127,7 +129,7 @@ def run_in_sandbox(
             process = _start(task, answer_file, directory)
             try:
                 process.wait(WALL_TIME_FACTOR * max_cpu_s)
-                is_timed_out = process.returncode == -getattr(signal, "SIGXCPU", 0)
+                is_timed_out = process.returncode in PROCESSOR_TIME_CODES
             except subprocess.TimeoutExpired:
                 is_timed_out = True
             finally:

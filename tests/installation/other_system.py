@@ -15,6 +15,8 @@ import multiprocessing
 import os
 import signal
 import sys
+from contextlib import suppress
+from pathlib import Path
 from types import SimpleNamespace
 
 MISSING_MODULES = {"fcntl", "resource"}
@@ -36,33 +38,31 @@ def locking(fd, mode, n_bytes):
 MSVCRT = SimpleNamespace(LK_NBLCK=2, locking=locking)
 
 
-def import_for_package(name, globals=None, *rest, **options):
+def import_for_package(name, importer=None, *rest, **options):
     """Import a module; for the package, those of Windows instead of those of POSIX."""
-    about = globals or {}
-    is_ours = about.get("__package__", "") or os.path.basename(about.get("__file__") or "")
-    if str(is_ours).startswith(("foveasim", "_sandboxed")):
+    about = importer or {}
+    importing = about.get("__package__") or Path(about.get("__file__") or "").name
+    if importing.startswith(("foveasim", "_sandboxed")):
         if name in MISSING_MODULES:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
         if name == "msvcrt":
             return MSVCRT
-    return import_module(name, globals, *rest, **options)
+    return import_module(name, importer, *rest, **options)
 
 
 def absolute(path, fd=None):
     """Return the absolute path of a file, or of one in an open directory."""
-    folder = os.getcwd() if fd is None else os.readlink(f"/proc/self/fd/{fd}")
-    return os.path.normpath(os.path.join(folder, os.fsdecode(path)))
+    folder = Path.cwd() if fd is None else Path(f"/proc/self/fd/{fd}").readlink()
+    return Path(os.path.normpath(folder / os.fsdecode(path)))
 
 
 def open_files():
     """Yield the paths of the files that this process has open."""
-    for fd in os.listdir("/proc/self/fd"):
-        try:
-            path = os.readlink(f"/proc/self/fd/{fd}")
-        except OSError:  # that of the listed directory
-            continue
-        if os.path.isfile(path):
-            yield path
+    for fd in list(Path("/proc/self/fd").iterdir()):
+        with suppress(OSError):  # that of the listed directory is closed
+            path = fd.readlink()
+            if path.is_file():
+                yield path
 
 
 def refuse_open_files(call, *keys):
@@ -71,8 +71,10 @@ def refuse_open_files(call, *keys):
     def checked(*paths, **options):
         named = [absolute(path, options.get(key)) for path, key in zip(paths, keys, strict=False)]
         for path in open_files():
-            if any(path == name or path.startswith(f"{name}/") for name in named):
-                raise PermissionError(errno.EACCES, "The process cannot access the file because it is being used", path)
+            if any(path.is_relative_to(name) for name in named):
+                raise PermissionError(
+                    errno.EACCES, "The process cannot access the file because it is being used", str(path)
+                )
         return call(*paths, **options)
 
     return checked
