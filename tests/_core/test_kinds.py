@@ -118,7 +118,7 @@ def test_aliases_have_the_kind_of_their_type(monkeypatch):
         "array", np.ndarray[Any, np.dtype[numbers]], type_params=(numbers,)
     )  # as numpy 2.5 defines NDArray
     other = TypeAliasType("other", array[np.float64])
-    monkeypatch.setattr(kinds, "ALIASES", (TypeAliasType,))
+    monkeypatch.setattr(kinds, "ALIASES", (*kinds.ALIASES, TypeAliasType))
 
     assert kinds.without_alias(array[np.float64]) == np.ndarray[Any, np.dtype[np.float64]]
     assert kinds.kind_of(other) == kinds.kind_of(NDArray[np.float64])
