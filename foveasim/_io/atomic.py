@@ -184,7 +184,7 @@ def lock(file: IO[bytes]) -> bool:
 
 
 def _lock_byte(fd: int) -> bool:
-    """Lock a byte of an open file, as Windows can; without effect where the system has no file locks."""
+    """Lock a byte of an open file, as Windows can; True where the system has no file locks."""
     try:
         import msvcrt
     except ImportError:

@@ -153,7 +153,11 @@ def resolve_annotation(annotation: Any, names: Mapping[str, Any]) -> Any:
 
 
 def without_alias(annotation: Any) -> Any:
-    """Return the type that an alias stands for, as numpy 2.5 and later define NDArray by ``type``; ArrayLike remains."""
+    """
+    Return the type that an alias stands for; ArrayLike remains.
+
+    From numpy 2.5, both NDArray and ArrayLike are aliases that the statement ``type`` defines.
+    """
     alias: Any = get_origin(annotation) or annotation
     if not isinstance(alias, ALIASES) or alias is ArrayLike:
         return annotation

@@ -382,7 +382,11 @@ def _open_study(optuna: Any, storage: str | Path | None, url: str | None, plan: 
 
 
 def _database(optuna: Any, url: str | None) -> Any:
-    """Return the storage of a URL; a file is open during queries only, because Windows does not remove open files."""
+    """
+    Return the storage of a URL.
+
+    A file is open during queries only: Windows does not remove open files.
+    """
     from sqlalchemy.pool import NullPool
 
     if url is None or _sqlite_path(url) is None:
