@@ -626,7 +626,7 @@ def _names(group: Any) -> tuple[str, ...]:
 
 
 def _layout_names(group: Any) -> dict[str, str]:
-    """Return the names of the layout's arrays in a store, by those of :func:`layout_to_arrays`."""
+    """Return names of the stored arrays of a layout, by those of :func:`layout_to_arrays`."""
     return dict(group.attrs.get("layout", {name: name for name in group[LAYOUT].array_keys()}))
 
 

@@ -86,7 +86,7 @@ def imitate():
     for module, names in MISSING.items():
         for name in names:
             delattr(module, name)
-    os.cpu_count = lambda: 1
+    os.cpu_count = os.process_cpu_count = lambda: 1  # the second from Python 3.13
     multiprocessing.get_all_start_methods = lambda: ["spawn"]
     for name in ("remove", "unlink", "rmdir"):
         setattr(os, name, refuse_open_files(getattr(os, name), "dir_fd"))
