@@ -37,7 +37,7 @@ OwnCheck = Annotated[T, OWN_CHECK]
 #: Words for the lengths of sequences.
 COUNTS = {1: "one", 2: "two", 3: "three", 4: "four"}
 #: Types of the aliases that the statement ``type`` of Python 3.12 defines.
-ALIASES: tuple[type, ...] = (typing.TypeAliasType,) if hasattr(typing, "TypeAliasType") else ()
+ALIASES: Any = (typing.TypeAliasType,) if hasattr(typing, "TypeAliasType") else ()
 #: Longest name of a file, and longest path, of the usual file systems.
 MAX_NAME_BYTES, MAX_PATH_BYTES = 255, 4095
 
