@@ -225,7 +225,7 @@ def test_environment_has_no_secrets(read, monkeypatch):
     about, _ = read("environment")
 
     assert "SECRET_OF_TEST" not in about["names"]
-    assert {*about["names"]} <= {*sandbox.ENVIRONMENT, *sandbox.INHERITED, "TMPDIR", "LC_CTYPE"}
+    assert {*about["names"]} <= {*sandbox.ENVIRONMENT, *sandbox.INHERITED, *sandbox.TEMPORARY, "LC_CTYPE"}
     if hasattr(os, "getsid"):
         assert about["session"] == about["group"] != os.getsid(0)
 
