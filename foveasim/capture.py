@@ -22,7 +22,7 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import Floats, Ints, check_count, frozen_array, read_only, unit_of, unmasked
 from foveasim._io.atomic import atomic_directory
 from foveasim._io.npz import open_archive, write_archive
-from foveasim._io.zarr_stores import ZARR, Variable, free_name, open_store, store_format, write_variables
+from foveasim._io.zarr_stores import ZARR, Variable, free_names, open_store, store_format, write_variables
 from foveasim.columns import COLUMNS, STORED, column_info, compute_column, find_column
 from foveasim.distortion import LENSES, BrownConrady, Fisheye
 from foveasim.errors import FileError, ParameterError
@@ -669,9 +669,8 @@ class Capture:
             "area_um2": _variable("area_um2", (SITE,), layout.area_um2),
             FILTER: _variable(FILTER, (FILTER,), np.array(self.filter_names)),
         }
-        names: dict[str, str] = {}
+        names = free_names(layout.columns, (*variables, *coordinates, *DERIVED))
         for name, values in layout.columns.items():
-            names[name] = free_name(name, {*variables, *coordinates, *DERIVED})
             coordinates[names[name]] = _variable(name, (SITE,), values, is_renamed=names[name] != name)
         return variables, coordinates, names
 

@@ -37,8 +37,8 @@ from foveasim._core.threads import cached_property
 from foveasim._core.validation import check_count, read_only
 from foveasim._io.formats import as_file_error
 from foveasim._io.mapped_files import in_memory
-from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resumable_directory
-from foveasim._io.zarr_stores import ZARR, open_group, store_format
+from foveasim._io.resumable import LOCK, disk_errors, partial_path, resumable_directory
+from foveasim._io.zarr_stores import ZARR, free_names, open_group, store_format
 from foveasim.camera import Camera
 from foveasim.camera._clock import Clock
 from foveasim.camera._footprints import find_footprints, placed
@@ -336,7 +336,8 @@ class TiledCapture:
             When the store is corrupt.
         """
         with _open(self.path) as group:
-            arrays = {name: array[:] for name, array in group[LAYOUT].arrays()}
+            stored = dict(group[LAYOUT].arrays())
+            arrays = {name: stored[key][:] for name, key in _layout_names(group).items()}
             return layout_from_arrays(arrays, group.attrs["provenance"])
 
     @cached_property
@@ -475,7 +476,8 @@ def write_tiles(
     if target.exists():
         _require_same(target, plan, layout)
         return read_tiles(target)
-    with resumable_directory(target, "tiled capture", is_ours=_is_tiles, has_content=_count_complete) as directory:
+    with resumable_directory(target, "tiled capture", is_ours=_is_tiles, has_content=_count_complete) as unfinished:
+        directory = unfinished.directory
         n_complete = _count_complete(directory)
         if n_complete:
             _require_same(directory, plan, layout)
@@ -497,7 +499,7 @@ def write_tiles(
                     _add(arrays, n_complete, capture)
                 n_complete += 1
             with disk_errors(target):
-                finish(directory, target)
+                unfinished.finish(target)
         except BaseException as error:
             if n_complete:
                 error.add_note(f"{n_complete:,} tiles are stored in {directory}; the same call resumes the capture")
@@ -585,6 +587,7 @@ def _create(directory: Path, camera: Camera, light: Scene | PowerMap, plan: Mapp
         "provenance": to_plain_data(dict(layout.provenance)),
         "plan": plan,
         "columns": [name for name in COLUMNS if name not in STORED and column_info(name).in_tables],
+        "layout": (names := free_names(layout_arrays := layout_to_arrays(layout, is_compact=True))),
     }
     group = import_optional(directory, "zarr").create_group(str(directory), zarr_format=3, attributes=attributes)
     n_sites, tile_sites = layout.n_sites, plan["tile_sites"]
@@ -599,7 +602,8 @@ def _create(directory: Path, camera: Camera, light: Scene | PowerMap, plan: Mapp
         )
     n_tiles = -(-n_sites // tile_sites)
     group.create_array(COMPLETE, shape=(n_tiles,), chunks=(1,), dtype="u1", dimension_names=("tile",), fill_value=0)
-    for name, stored in ((LAYOUT, layout_to_arrays(layout, is_compact=True)), (SENSOR, sensor.arrays)):
+    outlines = {names[name]: values for name, values in layout_arrays.items()}
+    for name, stored in ((LAYOUT, outlines), (SENSOR, sensor.arrays)):
         parts = group.create_group(name)
         for key, values in stored.items():
             chunks = (max(1, min(CHUNK, values.shape[0])), *values.shape[1:])
@@ -619,6 +623,11 @@ def _add(arrays: Mapping[str, Any], tile: int, capture: Capture) -> None:
 def _names(group: Any) -> tuple[str, ...]:
     """Return the names of the columns that were registered when a store was created."""
     return (*ARRAYS, *map(str, group.attrs.get("columns", ())))
+
+
+def _layout_names(group: Any) -> dict[str, str]:
+    """Return names of the stored arrays of a layout, by those of :func:`layout_to_arrays`."""
+    return dict(group.attrs.get("layout", {name: name for name in group[LAYOUT].array_keys()}))
 
 
 @contextmanager
@@ -655,7 +664,7 @@ def _require_same(directory: Path, plan: Mapping[str, Any], layout: Layout) -> N
         raise FileError(directory, "cannot be written: the path contains other data; choose another path")
     with _open(directory, is_finished=False) as group:
         different = next(iter(differences(group.attrs["plan"], dict(plan))), None)
-        if different is None and not _is_same_layout(group[LAYOUT], layout):
+        if different is None and not _is_same_layout(group, layout):
             different = "layout"
     if different is not None:
         raise FileError(
@@ -664,10 +673,10 @@ def _require_same(directory: Path, plan: Mapping[str, Any], layout: Layout) -> N
 
 
 def _is_same_layout(group: Any, layout: Layout) -> bool:
-    arrays = layout_to_arrays(layout, is_compact=True)
-    stored = dict(group.arrays())
-    if stored.keys() != arrays.keys():
+    arrays, names = layout_to_arrays(layout, is_compact=True), _layout_names(group)
+    if names.keys() != arrays.keys():
         return False
+    stored = {name: group[LAYOUT][key] for name, key in names.items()}
     return all(
         stored[name].shape == values.shape
         and all(

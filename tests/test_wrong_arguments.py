@@ -21,7 +21,7 @@ HUGE = 2**70
 
 def values_for(kind, plausible):
     """Return the invalid numbers for an annotation."""
-    text = str(kind)
+    text = str(kind).lower()
     if "float" not in text and "int" not in text and "ndarray" not in text and "array" not in text:
         return {}
     if isinstance(plausible, np.ndarray):

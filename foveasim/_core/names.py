@@ -16,6 +16,8 @@ CHANNEL_LETTERS = "channel_letters"
 #: Letters of colours, and the first letters of the names of their filters: clear and panchromatic ones are white.
 COLOURS = {"R": "r", "G": "g", "B": "b", "W": "wcp", "C": "cwp", "Y": "y", "M": "m", "E": "e", "N": "ni", "I": "in"}
 
+#: Names of devices on Windows, which no file or directory can have, with or without an extension.
+DEVICES = re.compile("con|prn|aux|nul|(com|lpt)[0-9¹²³]", re.IGNORECASE)
 #: Longest complete list of names in a message; of longer lists, it contains the closest names and the total number.
 MAX_LISTED = 16
 #: Similarity of names, 0 to 1, from which one is suggested for the other, as in :func:`difflib.get_close_matches`.

@@ -7,6 +7,7 @@ the package before the reader, so that it starts quickly and its limits apply to
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import importlib.util
@@ -41,14 +42,20 @@ CLONE3, CLONE_THREAD, X32_CALLS = 435, 0x00010000, 0x40000000
 
 
 def limit(kind: str, maximum: int) -> None:
-    """Set a resource limit, such as memory ("RLIMIT_AS") or time ("RLIMIT_CPU"), if supported."""
+    """
+    Set a resource limit, such as memory ("RLIMIT_AS") or time ("RLIMIT_CPU"), if supported.
+
+    Windows has none of them. macOS rejects limits of memory below the address space that each process reserves.
+    """
     try:
         import resource
-    except ImportError:
+
+        number = getattr(resource, kind)
+    except (ImportError, AttributeError):
         return
-    number = getattr(resource, kind)
     hard = resource.getrlimit(number)[1]
-    resource.setrlimit(number, (maximum if hard == resource.RLIM_INFINITY else min(maximum, hard), hard))
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(number, (maximum if hard == resource.RLIM_INFINITY else min(maximum, hard), hard))
 
 
 def deny_system_calls() -> bool:

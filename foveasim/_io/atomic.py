@@ -10,12 +10,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from foveasim.errors import FileError, disk_problem
 
 #: A disk with less free space than one block is full.
 FULL_DISK_BYTES = 4096
+#: Position of the byte that is locked on Windows, where no other program can read it: beyond the content of all files.
+LOCKED_BYTE = 2**31 - 2
 #: Waiting times before each attempt to remove a directory.
 RETRY_S = (0.0, 0.05, 0.25)
 
@@ -172,10 +174,41 @@ def lock(file: IO[bytes]) -> bool:
     """Lock an open file until it is closed; return False if another process has the lock."""
     try:
         import fcntl
-    except ImportError:  # the system has no file locks
-        return True
+    except ImportError:
+        return _lock_byte(file.fileno())
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     return True
+
+
+def _lock_byte(fd: int) -> bool:
+    """Lock a byte of an open file, as Windows can; True where the system has no file locks."""
+    try:
+        import msvcrt
+    except ImportError:
+        return True
+    system: Any = msvcrt
+    position = os.lseek(fd, 0, os.SEEK_CUR)
+    os.lseek(fd, LOCKED_BYTE, os.SEEK_SET)
+    try:
+        system.locking(fd, system.LK_NBLCK, 1)
+    except OSError:
+        return False
+    finally:
+        os.lseek(fd, position, os.SEEK_SET)
+    return True
+
+
+def rename_or_remove(file: IO[bytes], action: Callable[[], object]) -> None:
+    """
+    Rename or remove a locked file, or a directory that contains it.
+
+    The lock is held meanwhile where the system permits this; on Windows, the file is closed before.
+    """
+    try:
+        action()
+    except PermissionError:
+        file.close()
+        action()

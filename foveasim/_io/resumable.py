@@ -6,9 +6,9 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
-from foveasim._io.atomic import lock, remove_directory
+from foveasim._io.atomic import lock, remove_directory, rename_or_remove
 from foveasim.errors import FileError
 
 #: File that is locked while a directory is written, and extension of incomplete files of zarr.
@@ -31,17 +31,29 @@ def partial_path(path: str | Path) -> Path:
     return target.with_name(target.name + ".partial")
 
 
+class Unfinished(NamedTuple):
+    """A locked directory that is written, with the file of its lock."""
+
+    directory: Path
+    lock: IO[bytes]
+
+    def finish(self, target: Path) -> None:
+        """Rename the complete directory to its target."""
+        rename_or_remove(self.lock, lambda: self.directory.rename(target))
+        (target / LOCK).unlink(missing_ok=True)
+
+
 @contextmanager
 def resumable_directory(
     target: Path, what: str, *, is_ours: Callable[[Path], bool], has_content: Callable[[Path], object]
-) -> Iterator[Path]:
+) -> Iterator[Unfinished]:
     """
     Create or open the directory of an unfinished target, and lock it.
 
     ``target``: the finished directory; the unfinished one is :func:`partial_path`. ``what``: kind of the data, for messages.
     ``is_ours``: whether a directory contains such data. ``has_content``: whether a directory is worth resuming; if not, it is
-    deleted after the block. Yields ``directory``: call :func:`finish` at the end of the block. Raises FileError when the
-    directory contains other data, or another process writes it.
+    deleted after the block. Yields ``unfinished``, whose :meth:`~Unfinished.finish` is called at the end of the block. Raises
+    FileError when the directory contains other data, or another process writes it.
     """
     directory = partial_path(target)
     if not target.parent.is_dir():
@@ -61,16 +73,13 @@ def resumable_directory(
             for incomplete in directory.rglob(f"*{INCOMPLETE}"):
                 incomplete.unlink()
         try:
-            yield directory
+            yield Unfinished(directory, file)
         finally:
             if directory.exists() and not has_content(directory):
                 remove_directory(directory)
-
-
-def finish(directory: Path, target: Path) -> None:
-    """Rename a complete directory to its target."""
-    directory.rename(target)
-    (target / LOCK).unlink(missing_ok=True)
+                if _is_same_file(file, directory / LOCK):  # Windows keeps open files
+                    file.close()
+                    remove_directory(directory)
 
 
 @contextmanager

@@ -2,7 +2,8 @@
 Sandbox process with resource limits, for libraries that malformed files can crash.
 
 It protects against crashes, endless loops, and excessive memory, processor time and output of a library that reads a malformed
-file: a reader ends with one line, and the process and its descendants end with it. It has a minimal environment, without
+file, with the limits that the system has: Windows limits the time only, macOS not the memory. A reader ends with one line, and
+the process and, except on Windows, its descendants end with it. It has a minimal environment, without
 passwords and tokens of the parent, and a session of its own. On Linux (x86-64 and ARM, 64 bits), where the kernel permits
 filters of system calls, it can also not open network sockets, start processes or programs, or send signals.
 
@@ -35,6 +36,8 @@ from foveasim.errors import FileError
 #: Memory of the process and its libraries, and number of copies of the data in memory.
 BASE_BYTES, DATA_COPIES = 2**31, 3
 MAX_CPU_S, BYTES_PER_S = 10, 2**22
+#: Exit code of a process at the limit of its processor time; none on Windows.
+PROCESSOR_TIME_CODES = (-signal.SIGXCPU,) if hasattr(signal, "SIGXCPU") else ()
 #: Ratio of the wall time limit to the processor time limit, for busy machines.
 WALL_TIME_FACTOR = 5
 COMMAND = (sys.executable, "-P", str(Path(__file__).with_name("_sandboxed.py")))
@@ -48,6 +51,8 @@ ENVIRONMENT = {
 }
 #: Variables that Python and its libraries need to start.
 INHERITED = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "PYTHONHOME", "SYSTEMROOT", "WINDIR")
+#: Variables with the directory of temporary files; the last two on Windows.
+TEMPORARY = ("TMPDIR", "TEMP", "TMP")
 #: Size limits of an answer and of a header, and largest number of arrays.
 MAX_ANSWER_BYTES, MAX_ARRAYS = 2**28, 4096
 
@@ -124,7 +129,7 @@ def run_in_sandbox(
             process = _start(task, answer_file, directory)
             try:
                 process.wait(WALL_TIME_FACTOR * max_cpu_s)
-                is_timed_out = process.returncode == -getattr(signal, "SIGXCPU", 0)
+                is_timed_out = process.returncode in PROCESSOR_TIME_CODES
             except subprocess.TimeoutExpired:
                 is_timed_out = True
             finally:
@@ -227,7 +232,7 @@ def _start(task: bytes, output: Any, directory: str) -> subprocess.Popen[bytes]:
             stdin=file,
             stdout=output,
             stderr=subprocess.DEVNULL,
-            env={**inherited, "TMPDIR": directory, **ENVIRONMENT},
+            env={**inherited, **dict.fromkeys(TEMPORARY, directory), **ENVIRONMENT},
             start_new_session=True,
         )
 

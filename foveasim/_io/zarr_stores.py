@@ -12,7 +12,7 @@ import os
 import re
 import stat
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.extras import import_optional
-from foveasim._core.names import missing_path
+from foveasim._core.names import DEVICES, missing_path
 from foveasim._io.formats import as_file_error, check_version
 from foveasim.errors import FileError, format_value
 
@@ -42,20 +42,27 @@ class Variable:
     attributes: Mapping[str, Any]
 
 
-def free_name(name: str, taken: Collection[str]) -> str:
+def free_names(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str]:
     """
-    Return an unused array name that zarr, netCDF and xarray accept: letters, digits, ``_``.
+    Return unused array names that zarr, netCDF and xarray accept: letters, digits, ``_``.
+
+    An array is a directory of this name: it is none of a device, and names differ by more than the case of letters.
 
     Examples
     --------
-    >>> free_name("a/b", {"a_b"})
-    'a_b_'
+    >>> free_names(["a/b", "A", "a", "con"], {"a_b"})
+    {'a/b': 'a_b_', 'A': 'A', 'a': 'a_', 'con': 'con_'}
     """
-    safe = re.sub(r"\W", "_", name, flags=re.ASCII)[:MAX_NAME_LENGTH]
-    safe = safe if re.match(r"[A-Za-z]", safe) else f"column_{safe.lstrip('_')}"
-    while safe in taken:
-        safe += "_"
-    return safe
+    used = {name.casefold() for name in taken}
+    found: dict[str, str] = {}
+    for name in names:
+        safe = re.sub(r"\W", "_", name, flags=re.ASCII)[:MAX_NAME_LENGTH]
+        safe = safe if re.match(r"[A-Za-z]", safe) else f"column_{safe.lstrip('_')}"
+        while safe.casefold() in used or DEVICES.fullmatch(safe):
+            safe += "_"
+        used.add(safe.casefold())
+        found[name] = safe
+    return found
 
 
 def write_variables(group: Any, variables: Mapping[str, Variable]) -> None:

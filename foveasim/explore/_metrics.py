@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from foveasim._core.names import possible_names
+from foveasim._core.names import DEVICES, possible_names
 from foveasim.errors import ParameterError
 from foveasim.metrics.registry import METRICS, Metric, metric_info, options_of
 
@@ -77,6 +77,11 @@ def resolve_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | Non
             raise ParameterError("metrics", f"must not have the reserved name '{name}'")
         if name in found:
             raise ParameterError("metrics", "must have unique names", name)
+        if name.casefold() in map(str.casefold, found) or DEVICES.fullmatch(name):
+            # Results are stored in directories of these names, which some file systems do not distinguish.
+            raise ParameterError(
+                "metrics", "must have names of files, which differ by more than the case of letters", name
+            )
         found[name] = metric
     if not found:
         raise ParameterError("metrics", "must contain at least one metric")

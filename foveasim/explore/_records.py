@@ -11,6 +11,7 @@ import time
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.provenance import differences
-from foveasim._io.atomic import lock
+from foveasim._io.atomic import lock, rename_or_remove
 from foveasim.errors import FileError, ParameterError, type_name
 
 FORMAT, VERSION = "foveasim sweep", 1
@@ -224,7 +225,7 @@ class Journal:
 
     def remove(self) -> None:
         """Remove the file once its records are in the store."""
-        self.path.unlink(missing_ok=True)
+        rename_or_remove(self._file, partial(self.path.unlink, missing_ok=True))
 
     def _write(self, line: Any) -> None:
         text = json.dumps(line).encode()

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from multiprocessing import current_process, get_context
+from multiprocessing import current_process, get_all_start_methods, get_context
 from threading import current_thread, main_thread
 from typing import TYPE_CHECKING, Any
 
@@ -37,9 +37,9 @@ MEMORY_SETTINGS: dict[str, Any] = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
 }
-#: On Linux, local workers are forked from a process that has imported their modules: a new interpreter takes seconds. Libraries
-#: of macOS start threads on import, after which a process must not be forked.
-START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
+#: Local workers are forked from a process that has imported their modules: a new interpreter takes seconds. The first of these
+#: methods is the default, "spawn" where processes cannot be forked (Windows), or libraries start threads on import (macOS).
+START_METHOD = "spawn" if get_all_start_methods()[0] == "spawn" else "forkserver"
 #: Local clusters do not serve HTTP, which requires no certificate.
 NO_HTTP: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 

@@ -190,16 +190,17 @@ def save(session: Session, path: Path, text: str = "") -> None:
     """
     out = path.parent
     out.mkdir(parents=True, exist_ok=True)
-    originals = {path: path}
+    originals = {path.name.casefold(): path}  # some file systems ignore the case of letters
 
     def name_of(original: Path) -> str:
         """Return a name that no other file has, of these settings or of those saved before."""
 
         def is_usable(copied: Path) -> bool:
-            return originals.get(copied, original) == original and is_unused_or_copy(copied, original)
+            known = originals.get(copied.name.casefold(), original)
+            return known == original and is_unused_or_copy(copied, original)
 
         copied = unused_path(out / original.name, is_usable)
-        originals[copied] = original
+        originals[copied.name.casefold()] = original
         return copied.name
 
     settings, files = session.exported(name_of)

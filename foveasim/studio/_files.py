@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foveasim._core.names import DEVICES
 from foveasim._io.yaml_files import read_yaml
 from foveasim.config import (
     YAML_EXTENSIONS,
@@ -267,6 +268,7 @@ def file_name(name: str) -> str:
     stem, extension = (UNSAFE.sub("_", part).strip("_") for part in ((stem, extension) if dot else (extension, "")))
     extension = extension[:MAX_EXTENSION_LENGTH].lower()
     short = (stem or "file").encode()[:MAX_NAME_BYTES].decode(errors="ignore")
+    short = f"{short}_" if DEVICES.fullmatch(short) else short
     return f"{short}.{extension}" if extension else short
 
 

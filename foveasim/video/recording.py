@@ -19,8 +19,8 @@ from foveasim._core.names import missing_path
 from foveasim._core.provenance import differences, to_plain_data
 from foveasim._core.validation import Floats, check_count
 from foveasim._io.atomic import atomic_directory
-from foveasim._io.resumable import LOCK, disk_errors, finish, partial_path, resumable_directory
-from foveasim._io.zarr_stores import ZARR, open_group, store_format
+from foveasim._io.resumable import LOCK, disk_errors, partial_path, resumable_directory
+from foveasim._io.zarr_stores import ZARR, free_names, open_group, store_format
 from foveasim.camera._frames import DIGEST_BYTES
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError, type_name
@@ -164,7 +164,9 @@ def read_recording(path: str | Path) -> Recording:
         raise FileError(source, missing_path(source, "directory"))
     with _open_checked(source) as group:
         about = group.attrs
-        columns = {name: values[:] for name, values in group["columns"].arrays()}
+        stored = dict(group["columns"].arrays())
+        names = about.get("columns", {name: name for name in stored})
+        columns = {str(name): stored[key][:] for name, key in names.items()}
         return Recording(
             code=group["code"],
             exposure_s=group["exposure_s"][:],
@@ -271,7 +273,8 @@ def resume_recording(captures: Iterable[Capture], target: Path, plan: Mapping[st
     import_optional(target, "zarr")
     if target.exists():
         return _count_finished(captures, target, plan)
-    with resumable_directory(target, "recording", is_ours=_is_recording, has_content=_count_complete) as directory:
+    with resumable_directory(target, "recording", is_ours=_is_recording, has_content=_count_complete) as unfinished:
+        directory = unfinished.directory
         n_before = _count_complete(directory)
         if n_before:
             _check_plan(directory, plan)
@@ -285,7 +288,7 @@ def resume_recording(captures: Iterable[Capture], target: Path, plan: Mapping[st
                         frames.write()
             with disk_errors(target):
                 frames.write()
-                finish(directory, target)
+                unfinished.finish(target)
         except BaseException as error:
             with suppress(Exception):
                 frames.write()
@@ -477,6 +480,7 @@ class _Frames:
                 "settings": _json_round_trip(capture.settings),
                 "varied": [],
                 "provenance": to_plain_data(dict(layout.provenance)),
+                "columns": (names := free_names(layout.columns)),
                 "plan": _json_round_trip(self._plan),
             },
         )
@@ -485,7 +489,7 @@ class _Frames:
         group.create_array("filter_of_site", data=np.asarray(capture.filter_of_site))
         group.create_group("columns")
         for name, values in layout.columns.items():
-            group["columns"].create_array(name, data=np.asarray(values))
+            group["columns"].create_array(names[name], data=np.asarray(values))
         self._n_chunk = max(1, CHUNK_CODES // max(n_sites, 1))
         for name, shape, dtype, n_chunk, fill in (
             ("code", (0, n_sites), capture.code.dtype, self._n_chunk, 0),

@@ -5,12 +5,17 @@ from __future__ import annotations
 import os
 from fractions import Fraction
 from types import SimpleNamespace
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
+from typing_extensions import TypeAliasType
 
 import foveasim as fs
+from foveasim._core.calls import kinds
+from foveasim._core.calls.limits import Declaration
 from foveasim.errors import ParameterError
 
 LAYOUT = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
@@ -105,3 +110,17 @@ def test_list_that_contains_itself_is_rejected():
     endless.append(endless)
     with pytest.raises(ParameterError, match="'sensitivity' must be"):
         fs.Sensor(LAYOUT, sensitivity=endless)
+
+
+def test_aliases_have_the_kind_of_their_type(monkeypatch):
+    numbers = TypeVar("numbers", bound=np.generic)
+    array = TypeAliasType(
+        "array", np.ndarray[Any, np.dtype[numbers]], type_params=(numbers,)
+    )  # as numpy 2.5 defines NDArray
+    other = TypeAliasType("other", array[np.float64])
+    monkeypatch.setattr(kinds, "ALIASES", (*kinds.ALIASES, TypeAliasType))
+
+    assert kinds.without_alias(array[np.float64]) == np.ndarray[Any, np.dtype[np.float64]]
+    assert kinds.kind_of(other) == kinds.kind_of(NDArray[np.float64])
+    assert Declaration.of(float | array[np.float64]).is_per_site
+    assert kinds.kind_of(int | None).one == "an integer"

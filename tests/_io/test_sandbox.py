@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from waiting import DEADLINE_S, has_ended, wait_until
 
-from foveasim._io import sandbox
+from foveasim._io import _sandboxed, sandbox
 from foveasim._io.sandbox import iterate_in_sandbox, read_in_sandbox, run_in_sandbox
 from foveasim._io.zarr_stores import check_codecs, store_format
 from foveasim.errors import FileError
@@ -47,6 +47,20 @@ def number(path):
         yield np.array([os.getpid()])
 """
 MAX_BYTES = 2**32
+
+
+def test_limits_that_the_system_lacks_are_ignored(monkeypatch):
+    resource = pytest.importorskip("resource")
+
+    def reject(number, values):
+        raise ValueError("current limit exceeds maximum limit")
+
+    monkeypatch.setattr(resource, "setrlimit", reject)  # as macOS for memory
+    _sandboxed.limit("RLIMIT_AS", 2**31)
+    monkeypatch.delattr(resource, "RLIMIT_AS")
+    _sandboxed.limit("RLIMIT_AS", 2**31)
+    monkeypatch.setitem(sys.modules, "resource", None)
+    _sandboxed.limit("RLIMIT_AS", 2**31)
 
 
 @pytest.fixture
@@ -211,7 +225,7 @@ def test_environment_has_no_secrets(read, monkeypatch):
     about, _ = read("environment")
 
     assert "SECRET_OF_TEST" not in about["names"]
-    assert {*about["names"]} <= {*sandbox.ENVIRONMENT, *sandbox.INHERITED, "TMPDIR", "LC_CTYPE"}
+    assert {*about["names"]} <= {*sandbox.ENVIRONMENT, *sandbox.INHERITED, *sandbox.TEMPORARY, "LC_CTYPE"}
     if hasattr(os, "getsid"):
         assert about["session"] == about["group"] != os.getsid(0)
 

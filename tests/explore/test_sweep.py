@@ -1095,6 +1095,13 @@ def test_framed_reference_depends_on_distortion():
         ({"sensor.bits": [8]}, {"metrics": [lambda *_: 1]}, ParameterError, "must have names that are identifiers"),
         ({"sensor.bits": [8]}, {"metrics": {"seed": len}}, ParameterError, "must not have the reserved name 'seed'"),
         (
+            {"sensor.bits": [8]},
+            {"metrics": {"a": len, "A": len}},
+            ParameterError,
+            "more than the case of letters, got 'A'",
+        ),
+        ({"sensor.bits": [8]}, {"metrics": {"con": len}}, ParameterError, "must have names of files, .* got 'con'"),
+        (
             {"exposure_s": [8]},
             {"metrics": {"exposure_s": len}},
             ParameterError,

@@ -980,6 +980,8 @@ def main():
     names = options.names or (*CALLS, *(f"foveasim {name}" for name in COMMANDS))
     report, program = (path and str(path.absolute()) for path in (options.report, options.program))
     warnings.simplefilter("ignore")
+    # With PYTHONWARNDEFAULTENCODING, the package must not depend on the encoding of the locale.
+    warnings.filterwarnings("error", category=EncodingWarning, module="foveasim")
     with tempfile.TemporaryDirectory(prefix="foveasim-") as directory:
         objects = Objects(Path(directory).resolve())
         outcomes = {}

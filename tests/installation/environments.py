@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -41,11 +42,24 @@ def required_distributions(extra=None):
     return found
 
 
+def make_empty(directory):
+    """Create a virtual environment, and return its interpreter and its directory of packages."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(directory)], check=True)
+    site = sysconfig.get_path("purelib", "venv", {"base": str(directory), "platbase": str(directory)})
+    return directory / "bin" / "python", Path(site)
+
+
+def make_imitation(directory, module):
+    """Create an environment with all installed distributions, whose processes first import a module of this directory."""
+    python, site = make_empty(directory)
+    shutil.copy(Path(__file__).with_name(f"{module}.py"), site)
+    (site / "foveasim.pth").write_text(f"import {module}\n{sysconfig.get_path('purelib')}\n{ROOT}\n")
+    return python
+
+
 def make_environment(directory, extra=None):
     """Create a virtual environment of links, and return its interpreter."""
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(directory)], check=True)
-    python = directory / "bin" / "python"
-    site = Path(sysconfig.get_path("purelib", "venv", {"base": str(directory), "platbase": str(directory)}))
+    python, site = make_empty(directory)
     for name in required_distributions(extra):
         files = distribution(name).files or []
         for top in {file.parts[0] for file in files} - {"..", "__pycache__"}:

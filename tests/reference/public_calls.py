@@ -12,8 +12,10 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 import foveasim as fs
+from foveasim._core.calls.kinds import without_alias
 
 MODULES = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "generated_pages.py"))["MODULES"]
 #: Modules and calls that open windows, serve pages or need PyTorch.
@@ -125,6 +127,7 @@ def make_objects():
 
 def example(kind, objects):
     """Return a plausible value of a type."""
+    kind = without_alias(kind)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     simple = {float: 1.0, int: 2, bool: True, str: "x", Path: Path("file.npz")}
     if origin is typing.Annotated:
@@ -132,7 +135,7 @@ def example(kind, objects):
     if kind in simple:
         return simple[kind]
     if origin in (typing.Union, types.UnionType):
-        if any("array_like" in str(each) for each in arguments):
+        if any(each is ArrayLike or "array_like" in str(each) for each in arguments):
             return np.arange(1.0, 5.0)
         return "file.npz" if Path in arguments else example(arguments[0], objects)
     if origin is typing.Literal:
@@ -141,7 +144,7 @@ def example(kind, objects):
         return tuple(example(each, objects) for each in arguments if each is not Ellipsis)
     if origin in (list, collections.abc.Sequence, collections.abc.Iterable, collections.abc.Collection):
         return [example(arguments[0], objects)] * 2
-    if origin is np.ndarray:
+    if origin is np.ndarray or kind is ArrayLike:
         return np.arange(1.0, 5.0)
     if origin in (dict, collections.abc.Mapping):
         return {}

@@ -268,6 +268,9 @@ def test_start_settings_have_absolute_paths(tmp_path):
         ("Fovéa 網膜.PNG", "Fovéa_網膜.png"),
         ("網" * 300 + ".png", "網" * 40 + ".png"),
         ("fove\u0301a.png", "fovéa.png"),
+        ("con.png", "con_.png"),
+        ("COM1", "COM1_"),
+        ("console.yaml", "console.yaml"),
     ],
 )
 def test_names_of_uploads_are_safe(given, expected):

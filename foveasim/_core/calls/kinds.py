@@ -14,6 +14,7 @@ import builtins
 import inspect
 import os
 import sys
+import typing
 from collections import abc
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import InitVar
@@ -35,6 +36,8 @@ OWN_CHECK = "checked by the call"
 OwnCheck = Annotated[T, OWN_CHECK]
 #: Words for the lengths of sequences.
 COUNTS = {1: "one", 2: "two", 3: "three", 4: "four"}
+#: Types of the aliases that the statement ``type`` of Python 3.12 defines.
+ALIASES: Any = (typing.TypeAliasType,) if hasattr(typing, "TypeAliasType") else ()
 #: Longest name of a file, and longest path, of the usual file systems.
 MAX_NAME_BYTES, MAX_PATH_BYTES = 255, 4095
 
@@ -149,8 +152,22 @@ def resolve_annotation(annotation: Any, names: Mapping[str, Any]) -> Any:
         return Any
 
 
+def without_alias(annotation: Any) -> Any:
+    """
+    Return the type that an alias stands for; ArrayLike remains.
+
+    From numpy 2.5, both NDArray and ArrayLike are aliases that the statement ``type`` defines.
+    """
+    alias: Any = get_origin(annotation) or annotation
+    if not isinstance(alias, ALIASES) or alias is ArrayLike:
+        return annotation
+    value = alias.__value__
+    return without_alias(value[get_args(annotation)] if alias is not annotation else value)
+
+
 def kind_of(annotation: Any) -> Kind | None:
     """Return the kind of the values of a type; None if it accepts any value."""
+    annotation = without_alias(annotation)
     if isinstance(annotation, InitVar):
         return kind_of(annotation.type)
     if get_origin(annotation) is Annotated:
@@ -203,6 +220,7 @@ def _either(kinds: list[Kind]) -> Kind:
 
 def _single_kind(kind: Any) -> Kind | None:
     """Return the kind of a type that is not a union."""
+    kind = without_alias(kind)
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
         return kind_of(kind)
@@ -451,4 +469,4 @@ _KINDS: dict[Any, Kind] = {
     abc.Iterator: Kind(lambda value: hasattr(value, "__next__"), "an iterator", "iterators"),
     type: Kind(lambda value: isinstance(value, type), "a class", "classes"),
 }
-_ARRAY_LIKE = frozenset(get_args(ArrayLike))
+_ARRAY_LIKE = frozenset(get_args(ArrayLike) or (ArrayLike,))

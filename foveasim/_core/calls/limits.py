@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 
 import numpy as np
 
-from foveasim._core.calls.kinds import resolve_annotation
+from foveasim._core.calls.kinds import resolve_annotation, without_alias
 from foveasim._core.validation import (
     MAX_LENGTH_UM,
     MIN_LENGTH_UM,
@@ -215,6 +215,7 @@ class Declaration(NamedTuple):
     @classmethod
     def of(cls, annotation: Any) -> Declaration:
         """Return the declaration in a type, also in the members of a union."""
+        annotation = without_alias(annotation)
         if get_origin(annotation) is Annotated:
             first, *notes = get_args(annotation)
             found = cls.of(first)

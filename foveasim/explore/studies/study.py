@@ -20,7 +20,7 @@ from foveasim._core.calls import OwnCheck
 from foveasim._core.extras import import_optional
 from foveasim._core.names import possible_names
 from foveasim._core.random_streams import derive_seed
-from foveasim._io.atomic import lock
+from foveasim._io.atomic import lock, rename_or_remove
 from foveasim.errors import FileError, FoveasimError, printable
 from foveasim.explore._records import WORKER_LOST, Record, Value, check_same_plan
 from foveasim.explore.executor import KILLED, WORKERS, executor
@@ -370,14 +370,28 @@ def _open_study(optuna: Any, storage: str | Path | None, url: str | None, plan: 
     # An interrupt during a query makes SQLAlchemy log a cursor that it cannot close; the interrupt itself is raised.
     logging.getLogger("sqlalchemy.pool").addHandler(logging.NullHandler())
     directions = list(plan.objectives.values())
-    if url is None or plan.name not in optuna.get_all_study_names(storage=url):
-        return optuna.create_study(storage=url, study_name=plan.name, directions=directions)
-    optuna_study = optuna.load_study(storage=url, study_name=plan.name)
+    database = _database(optuna, url)
+    if url is None or plan.name not in optuna.get_all_study_names(storage=database):
+        return optuna.create_study(storage=database, study_name=plan.name, directions=directions)
+    optuna_study = optuna.load_study(storage=database, study_name=plan.name)
     if [direction.name.lower() for direction in optuna_study.directions] != directions:
         raise FileError(
             storage_name(storage), f"contains a study '{plan.name}' with other objectives; use another name"
         )
     return optuna_study
+
+
+def _database(optuna: Any, url: str | None) -> Any:
+    """
+    Return the storage of a URL.
+
+    A file is open during queries only: Windows does not remove open files.
+    """
+    from sqlalchemy.pool import NullPool
+
+    if url is None or _sqlite_path(url) is None:
+        return url
+    return optuna.storages.RDBStorage(url, engine_kwargs={"poolclass": NullPool})
 
 
 def _ask(optuna: Any, optuna_study: optuna.Study, plan: StudyPlan, n: int) -> optuna.Trial:
@@ -479,7 +493,7 @@ def _file_lock(storage: str | Path | None, url: str | None) -> Iterator[None]:
                     raise FileError(storage_name(storage), "is being written by another program that runs a study")
                 # Another program may remove the lock file at its end, after it was opened here.
                 is_locked = lock_path.exists() and os.path.samestat(lock_path.stat(), os.fstat(lock_file.fileno()))
-        stack.callback(partial(lock_path.unlink, missing_ok=True))
+        stack.callback(rename_or_remove, lock_file, partial(lock_path.unlink, missing_ok=True))
         yield
 
 
