@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Iterable
 from importlib.metadata import Distribution
@@ -94,9 +95,16 @@ def is_allowed(expression: str) -> bool:
     operators = {"AND": "and", "OR": "or", "(": "(", ")": ")"}
     logic = " ".join(operators.get(word) or str(word in ALLOWED) for word in words)
     try:
-        return bool(logic) and bool(eval(logic, {"__builtins__": {}}))  # True, False, and, or, parentheses
+        return is_true(ast.parse(logic, mode="eval").body)
     except SyntaxError:
         return False
+
+
+def is_true(node: ast.expr) -> bool:
+    """Return whether a tree of True, False, ``and`` and ``or`` is true."""
+    if isinstance(node, ast.BoolOp):
+        return (all if isinstance(node.op, ast.And) else any)(map(is_true, node.values))
+    return isinstance(node, ast.Constant) and node.value is True
 
 
 def gpl_libraries(names: Iterable[str]) -> list[str]:
