@@ -154,7 +154,7 @@ class Sensor:
     gaussian_above_e : float, e-
         Expectation above which ``"auto"`` approximates the Poisson distribution by its first three moments.
     full_well_e : float or (n_site,), optional, e-
-        Full well capacity; None for no limit except V_sat.
+        Full well capacity, in whole electrons: fractions have no effect. None for no limit except V_sat.
     coupling : InterPixelCapacitance, optional
         Inter-pixel capacitance, which acts after the draw.
     ktc_noise : bool
