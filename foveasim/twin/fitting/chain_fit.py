@@ -22,9 +22,9 @@ __all__ = ["ChainFit", "fit_chain"]
 
 #: Standard error of the nonlinearity up to which it is fitted, and its largest value.
 MAX_BEND_ERROR, MAX_BEND = 0.1, 0.3
-#: Charge over the full well above which levels of unknown light are full, and with which their fit starts. Largest full well
-#: over its first value.
-FULL, ABOVE, LARGEST = 0.95, 1.05, 1.4
+#: Charge of full levels of unknown light over the full well, with which their fit starts, and number of bisections of those of
+#: others. Largest full well over its first value.
+ABOVE, N_BISECTIONS, LARGEST = 1.05, 20, 1.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ def fit_chain(recording: Recording, defects: Defects, spread: Spread, before: Ch
     chain = Chain(recording.known, used.size, spread)
     if before is not None and well_e is not None and WELL not in names:
         names[WELL] = _full_well(chain, levels, exposures, before, light_e)
-        light_e[exposures.is_free & (light_e > FULL * names[WELL])] = ABOVE * names[WELL]
+        light_e = np.where(exposures.is_free, _charges(chain, levels, exposures, names), light_e)
 
     def fit(names: Mapping[str, float]) -> PooledFit:
         return fit_levels(
@@ -124,7 +124,7 @@ def _full_well(chain: Chain, levels: Levels, exposures: Exposures, before: Chain
     light_e = np.where(np.isnan(amounts * rates), start_e, amounts * rates)
     if exposures.is_free[highest]:
         light_e[highest] = LARGEST * guess
-    dark_e = values.get("dark_e_per_s", 0.0) * exposures.exposure_s
+    dark_e = _dark_e(values, exposures)
 
     def above(well_e: float) -> float:
         moments = chain.moments({**values, WELL: well_e}, light_e, dark_e)
@@ -132,6 +132,27 @@ def _full_well(chain: Chain, levels: Levels, exposures: Exposures, before: Chain
 
     low, high = 0.7 * guess, LARGEST * guess
     return float(brentq(above, low, high, rtol=1e-6)) if above(low) * above(high) < 0.0 else guess
+
+
+def _charges(chain: Chain, levels: Levels, exposures: Exposures, values: Mapping[str, float]) -> Floats:
+    """
+    Return the charges of light with the means of the levels, (n_level,) e-.
+
+    They end a little above the full well. Where some pixels are full, a step of the search could leave the full well, with
+    other weights.
+    """
+    low_e, high_e = np.zeros(levels.mean_dn.size), np.full(levels.mean_dn.size, ABOVE * values[WELL])
+    dark_e = _dark_e(values, exposures)
+    for _ in range(N_BISECTIONS):
+        middle_e = 0.5 * (low_e + high_e)
+        is_above = chain.moments(values, middle_e, dark_e).mean_dn > levels.mean_dn
+        low_e, high_e = np.where(is_above, low_e, middle_e), np.where(is_above, middle_e, high_e)
+    return high_e
+
+
+def _dark_e(values: Mapping[str, float], exposures: Exposures) -> Floats:
+    """Return the charges of dark current at the lowest temperature, (n_level,) e-."""
+    return values.get("dark_e_per_s", 0.0) * exposures.exposure_s
 
 
 def _without_telegraph(
