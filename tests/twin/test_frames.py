@@ -62,7 +62,11 @@ def camera_of(seed):
 
 
 def stacks_of(sensor, seed=0, n_frames=16):
-    """Dark stacks of three exposure times, and flat stacks beyond the full well; the top row of frames is the last one."""
+    """
+    Dark stacks of three exposure times, and flat stacks beyond the full well; the top row of frames is the last one.
+
+    They use the 24 seeds from ``seed``.
+    """
 
     def frames(rate, exposure_s, n, own):
         return np.stack(
@@ -410,7 +414,7 @@ def test_intervals_contain_parameters_of_random_cameras():
     hits: dict[str, list[bool]] = {}
     for seed in range(40):
         sensor, adc = camera_of(seed)
-        found, truth = fs.twin.fit(stacks_of(sensor, seed), pixel_um=3.0, **adc), truth_of(sensor)
+        found, truth = fs.twin.fit(stacks_of(sensor, 24 * seed), pixel_um=3.0, **adc), truth_of(sensor)
         for name, value in truth.items():
             if name in found.estimates and (value or not name.startswith("rts")):
                 each = found.estimates[name]
