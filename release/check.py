@@ -27,7 +27,7 @@ from pathlib import Path
 
 from installations import CORE, RESULTS, measure, new_environment, read_results, write_results
 from licences import exceptions, question_of
-from programs import CheckError, run
+from processes import CheckError, run
 
 from foveasim._core.extras import EXTRA_OF
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from licences import gpl_libraries, licence_of, name_of
-from programs import CheckError, run
+from processes import CheckError, run
 
 ROOT = Path(__file__).parents[1]
 CALLS = ROOT / "tests" / "installation" / "calls.py"

@@ -191,11 +191,11 @@ def test_licence_tables_name_all_dependencies(release):
 
 
 def test_failed_program_raises_its_last_line(release):
-    programs = release("programs")
+    processes = release("processes")
 
-    assert programs.run(sys.executable, "-c", "print(7)") == "7\n"
-    with pytest.raises(programs.CheckError, match=r"(?s)-c .* failed:.*out of paper"):
-        programs.run(sys.executable, "-c", "raise SystemExit('out of paper')")
+    assert processes.run(sys.executable, "-c", "print(7)") == "7\n"
+    with pytest.raises(processes.CheckError, match=r"(?s)-c .* failed:.*out of paper"):
+        processes.run(sys.executable, "-c", "raise SystemExit('out of paper')")
 
 
 @pytest.mark.parametrize(
