@@ -383,6 +383,36 @@ def test_photographs_of_planes_require_a_lens_model():
     np.testing.assert_array_equal(found, expected)
 
 
+def test_psfs_of_designs_blur_panoramas():
+    """Blur of a Gaussian PSF keeps equal radiances and the light of a sky, and removes its fine waves."""
+    x_um = (np.arange(49) - 24.0) * 0.5
+    psf = np.exp(-(x_um[:, None] ** 2 + x_um**2) / (2.0 * 2.0**2))
+    psfs = fs.optics.PSFGrid(
+        psf=psf[None, None],
+        x_um=np.zeros(1),
+        y_um=np.zeros(1),
+        wavelength_nm=np.array([550.0]),
+        pitch_um=0.5,
+        centre=(24.0, 24.0),
+    )
+    waves = 1.0 + np.cos(360.0 * np.linspace(-np.pi, np.pi, 2880, endpoint=False)) * np.ones((1440, 1))
+    sensor = fs.Sensor(fs.layout.grid(n_x=40, n_y=40, pitch_um=3.0))
+    found = {}
+    for name, sky in (("equal", np.ones((64, 128))), ("waves", waves)):
+        scene = fs.Scene.from_panorama(sky, luminance_cd_m2=100.0)
+        for own in (None, psfs):
+            optics = fs.Optics(focal_length_mm=0.4, f_number=2.0, psfs=own)
+            camera = fs.Camera(
+                optics=optics, sensor=sensor, distortion=Fisheye(projection="equidistant", focal_um=400.0)
+            )
+            found[name, own is None] = camera.capture(scene, exposure_s=0.01, seed=0).expected_e.reshape(40, 40)
+    inner = np.s_[8:-8, 8:-8]
+
+    np.testing.assert_allclose(found["equal", False][inner], found["equal", True][inner], rtol=1e-3)
+    assert found["waves", False][inner].sum() == pytest.approx(found["waves", True][inner].sum(), rel=0.03)
+    assert found["waves", False][inner].std() < 0.25 * found["waves", True][inner].std()
+
+
 def test_fisheye_photograph_and_its_panorama_agree():
     """A photograph of an equirectangular panorama by a calibrated lens, seen by another camera."""
     n, pixel_um = 801, 60.0
