@@ -27,6 +27,8 @@ N_BINS = 400
 N_PROBABILITIES = 4096
 #: First amplitudes of the search, in standard deviations of the noise, and first fractions.
 AMPLITUDES, FRACTIONS = (3.0, 6.0, 12.0, 25.0, 60.0), (0.003, 0.03, 0.2)
+#: Step of numerical derivatives of logarithms.
+STEP = 2e-3
 #: Smallest number of frames, and of pixels with RTS noise for an interval.
 MIN_FRAMES, MIN_PIXELS = 4, 5
 
@@ -65,9 +67,11 @@ def fit_telegraph(variance_dn2: Floats, n_frames: int) -> TelegraphFit | None:
     counts = np.histogram(values, edges)[0].astype(np.float64)
     is_used = counts > 0.0
 
+    def log_masses(vector: Floats) -> Floats:
+        return np.log(np.maximum(_masses(edges, n_frames, *_unpack(vector))[is_used], 1e-300))
+
     def negative(vector: Floats) -> float:
-        masses = _masses(edges, n_frames, *_unpack(vector))
-        return -float(counts[is_used] @ np.log(np.maximum(masses[is_used], 1e-300)))
+        return -float(counts[is_used] @ log_masses(vector))
 
     single = optimize.minimize_scalar(
         lambda log: (
@@ -89,7 +93,12 @@ def fit_telegraph(variance_dn2: Floats, n_frames: int) -> TelegraphFit | None:
     noise, fraction, step = _unpack(found.x)
     if 2.0 * (single.fun - found.fun) < MIN_RATIO or fraction * values.size < MIN_PIXELS or fraction > 0.6:
         return None
-    covariance = np.linalg.pinv(_hessian(negative, found.x))
+    # Pixels are not exactly of the mixture, such as those of companded codes: errors by the scores of pixels ("sandwich").
+    inverse = np.linalg.pinv(_hessian(negative, found.x))
+    scores = np.stack([log_masses(found.x + each) - log_masses(found.x - each) for each in STEP * np.eye(3)]) / (
+        2.0 * STEP
+    )
+    covariance = inverse @ (counts[is_used] * scores) @ scores.T @ inverse
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     grid = np.geomspace(values.min(), values.max(), N_PROBABILITIES)
     with_rts = fraction * _density(grid, n_frames, noise, step)
@@ -150,7 +159,7 @@ def _density(values: Floats, n_frames: int, noise: float, step: float) -> Floats
 
 def _hessian(function: object, at: Floats) -> Floats:
     """Return second derivatives by central differences."""
-    n, step = at.size, 2e-3
+    n, step = at.size, STEP
     found = np.empty((n, n))
     for i in range(n):
         for j in range(n):
