@@ -156,7 +156,7 @@ class Chain:
             "nonlinearity_fraction": min(max(values.get("nonlinearity_fraction", 0.0), -MAX_BEND), MAX_BEND),
         }
 
-    def _step_dn(self, values: Mapping[str, float]) -> int:
+    def _step_dn(self, parameters: Mapping[str, Any]) -> int:
         """
         Return the width of codes of a coarser ADC that gives the same moments, a power of 2.
 
@@ -165,7 +165,7 @@ class Chain:
         """
         if not self.adc.is_linear:
             return 1
-        sigma_dn = values["gain_dn_per_e"] * math.sqrt(max(values["read_noise_e2"], 0.0))
+        sigma_dn = parameters["gain_dn_per_e"] * parameters["read_noise_e"]
         return int(2 ** max(math.floor(math.log2(max(sigma_dn / SMOOTH_SIGMA, 1.0))), 0))
 
     def moments(self, values: Mapping[str, float], light_e: Floats, dark_e: Floats) -> Moments:
@@ -187,7 +187,7 @@ class Chain:
             self._layouts[charge_e.size] = grid(n_x=charge_e.size, n_y=1, pitch_um=1.0)
         effects = [OffsetMap(offsets_e[index])] if np.any(offset_e) else []
         parameters = self.parameters(values) | {"full_well_e": well}
-        step = self._step_dn(values)
+        step = self._step_dn(parameters)
         parameters |= {
             "bits": parameters["bits"] - step.bit_length() + 1,
             "gain_dn_per_e": values["gain_dn_per_e"] / step,

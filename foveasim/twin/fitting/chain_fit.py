@@ -22,8 +22,8 @@ __all__ = ["ChainFit", "fit_chain"]
 
 #: Standard error of the nonlinearity up to which it is fitted, and its largest value.
 MAX_BEND_ERROR, MAX_BEND = 0.1, 0.3
-#: Charge of full levels of unknown light over the full well, with which their fit starts, and number of bisections of those of
-#: others. Largest full well over its first value.
+#: Largest charge, over the full well, with which the fit of a level of unknown light starts, and number of bisections for it.
+#: Largest full well over its first value.
 ABOVE, N_BISECTIONS, LARGEST = 1.05, 20, 1.4
 
 
@@ -119,12 +119,10 @@ def _full_well(chain: Chain, levels: Levels, exposures: Exposures, before: Chain
     values = before.values
     guess = before.well_e * before.start.values["gain_dn_per_e"] / values["gain_dn_per_e"]
     highest = int(np.argmax(levels.mean_dn))
-    names, amounts = exposures.light_parameter, exposures.light
-    rates = np.array([values.get(name, math.nan) for name in names])
-    light_e = np.where(np.isnan(amounts * rates), start_e, amounts * rates)
+    light_e = np.where(exposures.is_free, start_e, exposures.light_e(values))
     if exposures.is_free[highest]:
         light_e[highest] = LARGEST * guess
-    dark_e = _dark_e(values, exposures)
+    dark_e = exposures.dark_e(values)
 
     def above(well_e: float) -> float:
         moments = chain.moments({**values, WELL: well_e}, light_e, dark_e)
@@ -142,17 +140,12 @@ def _charges(chain: Chain, levels: Levels, exposures: Exposures, values: Mapping
     other weights.
     """
     low_e, high_e = np.zeros(levels.mean_dn.size), np.full(levels.mean_dn.size, ABOVE * values[WELL])
-    dark_e = _dark_e(values, exposures)
+    dark_e = exposures.dark_e(values)
     for _ in range(N_BISECTIONS):
         middle_e = 0.5 * (low_e + high_e)
         is_above = chain.moments(values, middle_e, dark_e).mean_dn > levels.mean_dn
         low_e, high_e = np.where(is_above, low_e, middle_e), np.where(is_above, middle_e, high_e)
     return high_e
-
-
-def _dark_e(values: Mapping[str, float], exposures: Exposures) -> Floats:
-    """Return the charges of dark current at the lowest temperature, (n_level,) e-."""
-    return values.get("dark_e_per_s", 0.0) * exposures.exposure_s
 
 
 def _without_telegraph(

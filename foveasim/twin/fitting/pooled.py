@@ -72,6 +72,19 @@ class Exposures:
         """Levels of unknown light."""
         return np.isnan(self.light)
 
+    def light_e(self, values: Mapping[str, float]) -> Floats:
+        """Return the charges of light for parameters, (n_level,) e-; NaN for unknown light."""
+        pairs = zip(self.light, self.light_parameter, strict=True)
+        return self.light * np.array([values[name] if amount > 0.0 else 0.0 for amount, name in pairs])
+
+    def dark_e(self, values: Mapping[str, float]) -> Floats:
+        """Return the charges of dark current for parameters, (n_level,) e-."""
+        charge_e = values.get("dark_e_per_s", 0.0) * self.exposure_s
+        if "dark_doubling_k" not in values:
+            return np.asarray(charge_e)
+        above_k = self.temperature_k - np.nanmin(self.temperature_k)
+        return np.asarray(charge_e * 2.0 ** (above_k / values["dark_doubling_k"]))
+
 
 @dataclass(frozen=True, eq=False)
 class PooledFit:
@@ -226,18 +239,9 @@ class _Model:
     def charges(self, vector: Floats) -> tuple[dict[str, float], Floats, Floats]:
         """Return the parameters, and charges of light and of dark current, (n_level,) e-."""
         values, free_e = self.unpack(vector)
-        light_e = np.array(
-            [
-                0.0 if amount == 0.0 or np.isnan(amount) else amount * values[name]
-                for amount, name in zip(self.exposures.light, self.exposures.light_parameter, strict=True)
-            ]
-        )
+        light_e = self.exposures.light_e(values)
         light_e[self.free] = free_e
-        dark_e = values.get("dark_e_per_s", 0.0) * self.exposures.exposure_s
-        if "dark_doubling_k" in values:
-            reference_k = np.nanmin(self.exposures.temperature_k)
-            dark_e = dark_e * 2.0 ** ((self.exposures.temperature_k - reference_k) / values["dark_doubling_k"])
-        return values, light_e, dark_e
+        return values, light_e, self.exposures.dark_e(values)
 
     def add_common_errors(self, vector: Floats, variance_error_dn2: float) -> None:
         """Include the errors of all variances, and of the spread over pixels, in the covariance."""
