@@ -38,7 +38,7 @@ from foveasim._core.validation import check_count, read_only
 from foveasim._io.formats import as_file_error
 from foveasim._io.mapped_files import in_memory
 from foveasim._io.resumable import LOCK, disk_errors, partial_path, resumable_directory
-from foveasim._io.zarr_stores import ZARR, free_names, open_group, store_format
+from foveasim._io.zarr_stores import ZARR, free_names, named_arrays, open_group, store_format
 from foveasim.camera import Camera
 from foveasim.camera._clock import Clock
 from foveasim.camera._footprints import find_footprints, placed
@@ -336,8 +336,7 @@ class TiledCapture:
             When the store is corrupt.
         """
         with _open(self.path) as group:
-            stored = dict(group[LAYOUT].arrays())
-            arrays = {name: stored[key][:] for name, key in _layout_names(group).items()}
+            arrays = {name: values[:] for name, values in _layout_arrays(group).items()}
             return layout_from_arrays(arrays, group.attrs["provenance"])
 
     @cached_property
@@ -578,6 +577,8 @@ def _create(directory: Path, camera: Camera, light: Scene | PowerMap, plan: Mapp
         elif path.name != LOCK:
             path.unlink()
     sensor, layout = camera.sensor, camera.layout
+    outlines = layout_to_arrays(layout, is_compact=True)
+    names = free_names(outlines)
     attributes = {
         "format": FORMAT,
         "version": VERSION,
@@ -587,7 +588,7 @@ def _create(directory: Path, camera: Camera, light: Scene | PowerMap, plan: Mapp
         "provenance": to_plain_data(dict(layout.provenance)),
         "plan": plan,
         "columns": [name for name in COLUMNS if name not in STORED and column_info(name).in_tables],
-        "layout": (names := free_names(layout_arrays := layout_to_arrays(layout, is_compact=True))),
+        "layout": names,
     }
     group = import_optional(directory, "zarr").create_group(str(directory), zarr_format=3, attributes=attributes)
     n_sites, tile_sites = layout.n_sites, plan["tile_sites"]
@@ -602,8 +603,8 @@ def _create(directory: Path, camera: Camera, light: Scene | PowerMap, plan: Mapp
         )
     n_tiles = -(-n_sites // tile_sites)
     group.create_array(COMPLETE, shape=(n_tiles,), chunks=(1,), dtype="u1", dimension_names=("tile",), fill_value=0)
-    outlines = {names[name]: values for name, values in layout_arrays.items()}
-    for name, stored in ((LAYOUT, outlines), (SENSOR, sensor.arrays)):
+    renamed = {names[name]: values for name, values in outlines.items()}
+    for name, stored in ((LAYOUT, renamed), (SENSOR, sensor.arrays)):
         parts = group.create_group(name)
         for key, values in stored.items():
             chunks = (max(1, min(CHUNK, values.shape[0])), *values.shape[1:])
@@ -625,9 +626,9 @@ def _names(group: Any) -> tuple[str, ...]:
     return (*ARRAYS, *map(str, group.attrs.get("columns", ())))
 
 
-def _layout_names(group: Any) -> dict[str, str]:
-    """Return names of the stored arrays of a layout, by those of :func:`layout_to_arrays`."""
-    return dict(group.attrs.get("layout", {name: name for name in group[LAYOUT].array_keys()}))
+def _layout_arrays(group: Any) -> dict[str, Any]:
+    """Return the stored arrays of a layout, by the names of :func:`layout_to_arrays`."""
+    return named_arrays(group[LAYOUT], group.attrs.get("layout"))
 
 
 @contextmanager
@@ -673,10 +674,9 @@ def _require_same(directory: Path, plan: Mapping[str, Any], layout: Layout) -> N
 
 
 def _is_same_layout(group: Any, layout: Layout) -> bool:
-    arrays, names = layout_to_arrays(layout, is_compact=True), _layout_names(group)
-    if names.keys() != arrays.keys():
+    arrays, stored = layout_to_arrays(layout, is_compact=True), _layout_arrays(group)
+    if stored.keys() != arrays.keys():
         return False
-    stored = {name: group[LAYOUT][key] for name, key in names.items()}
     return all(
         stored[name].shape == values.shape
         and all(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import re
+import runpy
 import shutil
 import sys
 import time
@@ -75,12 +76,8 @@ def calls_in(python: Path, directory: Path, names: list[str]) -> dict[str, str]:
         str(python), str(script), "--report", str(report), *program, *names,
         cwd=directory, MPLBACKEND="agg", PYTHONPATH="", TMPDIR=str(directory),
     )  # fmt: skip
+    required_extra = runpy.run_path(str(CALLS))["required_extra"]
     return {name: required_extra(text) for name, text in json.loads(report.read_text("utf-8")).items()}
-
-
-def required_extra(outcome: str) -> str:
-    """Return the extra that the outcome of a call names, empty for none."""
-    return outcome.partition("foveasim[")[2].partition("]")[0]
 
 
 def measure(

@@ -65,6 +65,16 @@ def free_names(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str
     return found
 
 
+def named_arrays(group: Any, names: Mapping[str, str] | None) -> dict[str, Any]:
+    """
+    Return the arrays of a group by the names that :func:`free_names` replaced.
+
+    ``names``: its result, or None for a store without one, whose arrays have their own names.
+    """
+    stored = dict(group.arrays())
+    return stored if names is None else {str(name): stored[key] for name, key in names.items()}
+
+
 def write_variables(group: Any, variables: Mapping[str, Variable]) -> None:
     """
     Write arrays to an open group, each uncompressed in one chunk, with dimension names.

@@ -20,7 +20,7 @@ from foveasim._core.provenance import differences, to_plain_data
 from foveasim._core.validation import Floats, check_count
 from foveasim._io.atomic import atomic_directory
 from foveasim._io.resumable import LOCK, disk_errors, partial_path, resumable_directory
-from foveasim._io.zarr_stores import ZARR, free_names, open_group, store_format
+from foveasim._io.zarr_stores import ZARR, free_names, named_arrays, open_group, store_format
 from foveasim.camera._frames import DIGEST_BYTES
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError, type_name
@@ -164,9 +164,8 @@ def read_recording(path: str | Path) -> Recording:
         raise FileError(source, missing_path(source, "directory"))
     with _open_checked(source) as group:
         about = group.attrs
-        stored = dict(group["columns"].arrays())
-        names = about.get("columns", {name: name for name in stored})
-        columns = {str(name): stored[key][:] for name, key in names.items()}
+        stored = named_arrays(group["columns"], about.get("columns"))
+        columns = {name: values[:] for name, values in stored.items()}
         return Recording(
             code=group["code"],
             exposure_s=group["exposure_s"][:],
@@ -469,6 +468,7 @@ class _Frames:
                 shutil.rmtree(path)
             elif path.name != LOCK:
                 path.unlink()
+        names = free_names(layout.columns)
         group = import_optional(self._directory, "zarr").create_group(
             str(self._directory),
             attributes={
@@ -480,7 +480,7 @@ class _Frames:
                 "settings": _json_round_trip(capture.settings),
                 "varied": [],
                 "provenance": to_plain_data(dict(layout.provenance)),
-                "columns": (names := free_names(layout.columns)),
+                "columns": names,
                 "plan": _json_round_trip(self._plan),
             },
         )

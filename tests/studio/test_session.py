@@ -548,25 +548,17 @@ def test_saved_pictures_never_share_a_name(make_session, tmp_path):
     assert (out / "photo.png").read_bytes() not in {path.read_bytes() for path in files.values()}
 
 
-def test_copies_differ_by_more_than_case(make_session, tmp_path):
+@pytest.mark.parametrize("name", ["lines.yaml", "LINES.yaml"])
+def test_saved_settings_replace_no_upload(make_session, name, tmp_path):
+    """Also where the file system ignores the case of letters."""
     recorder = make_session(out=tmp_path / "out")
     path = recorder.session.add_file("lines.yaml", b"generator: grid\n")
     recorder.session.history.commit({**recorder.session.history.settings, "layout": {"file": str(path)}})
-    recorder.do(do="save", name="LINES.yaml")
-    saved = read_settings(tmp_path / "out" / "LINES.yaml")
+    recorder.do(do="save", name=name)
+    saved = read_settings(tmp_path / "out" / name)
 
     assert saved["layout"]["file"] == "lines_2.yaml"
     assert (tmp_path / "out" / "lines_2.yaml").read_bytes() == path.read_bytes()
-
-
-def test_saved_settings_replace_no_upload(make_session, tmp_path):
-    recorder = make_session(out=tmp_path / "out")
-    path = recorder.session.add_file("shot.yaml", b"generator: grid\n")
-    recorder.session.history.commit({**recorder.session.history.settings, "layout": {"file": str(path)}})
-    recorder.do(do="save", name="shot.yaml")
-    saved = read_settings(tmp_path / "out" / "shot.yaml")
-
-    assert (tmp_path / "out" / saved["layout"]["file"]).read_bytes() == path.read_bytes()
 
 
 def test_failed_upload_returns_its_bytes(recorder, monkeypatch):
